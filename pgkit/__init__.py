@@ -1,0 +1,1 @@
+"""pgkit: policy-gradient building blocks on TorchRL."""

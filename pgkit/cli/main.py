@@ -1,0 +1,131 @@
+"""``pgkit ls / cp / run / eval / plot``. Heavy imports wait until a command needs them."""
+
+import argparse
+import runpy
+import shutil
+import sys
+from collections.abc import Sequence
+from importlib import metadata
+from pathlib import Path
+from typing import NoReturn
+
+from pgkit.cli import recipes
+from pgkit.errors import UserError
+
+
+class Parser(argparse.ArgumentParser):
+    """Says what is wrong with the command line in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        raise UserError(f"{message} (see {self.prog} --help)")
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Run one command: exit 2 and one line on a user's error, 130 on Ctrl-C."""
+    try:
+        args = parser().parse_args(argv)
+        args.command(args)
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        sys.exit(130)
+
+
+def parser() -> Parser:
+    """The command line's grammar."""
+    top = Parser(prog="pgkit", description="Policy-gradient building blocks on TorchRL.", allow_abbrev=False)
+    top.add_argument("--version", action="version", version=f"pgkit {metadata.version('pgkit')}")
+    commands = top.add_subparsers(required=True, metavar="COMMAND")
+
+    command = commands.add_parser("ls", help="list the recipes")
+    command.set_defaults(command=list_recipes)
+
+    command = commands.add_parser("cp", help="copy a recipe, to edit it")
+    command.add_argument("recipe", help="a name that pgkit ls shows")
+    command.add_argument("file", type=Path, help="where to; a file that exists is not overwritten")
+    command.set_defaults(command=copy_recipe)
+
+    command = commands.add_parser(
+        "run", help="train with a recipe", usage="pgkit run RECIPE [FLAGS]", add_help=False
+    )
+    command.add_argument(
+        "recipe", help="a name that pgkit ls shows, or a file; RECIPE --help lists its flags"
+    )
+    command.add_argument("flags", nargs=argparse.REMAINDER)
+    command.set_defaults(command=run_recipe)
+
+    command = commands.add_parser("eval", help="play whole episodes with a trained policy")
+    command.add_argument("run_dir", type=Path, metavar="RUN_DIR")
+    command.add_argument("--episodes", type=positive, default=10, help="how many (default: 10)")
+    command.add_argument("--seed", type=int, default=0, help="of the envs (default: 0)")
+    command.add_argument(
+        "--which", choices=["best", "latest"], default="best", help="checkpoint (default: best)"
+    )
+    command.set_defaults(command=evaluate_run)
+
+    command = commands.add_parser("plot", help="draw the learning curves of runs; seeds are averaged")
+    command.add_argument("run_dirs", type=Path, nargs="+", metavar="RUN_DIR")
+    command.add_argument(
+        "-o", "--out", type=Path, help="image file (default: curve.png in RUN_DIR, or curves.png for several)"
+    )
+    command.set_defaults(command=plot_runs)
+    return top
+
+
+def positive(text: str) -> int:
+    """An int of at least 1."""
+    if (value := int(text)) < 1:
+        raise argparse.ArgumentTypeError(f"{text} is not a positive number")
+    return value
+
+
+def list_recipes(_: argparse.Namespace) -> None:
+    for name in recipes.names():
+        print(f"{name:<12} {recipes.first_line(recipes.find(name))}")
+
+
+def copy_recipe(args: argparse.Namespace) -> None:
+    source, target = recipes.find(args.recipe), args.file
+    if target.is_dir():
+        target = target / source.name
+    if target.exists():
+        raise UserError(f"{target} exists and is not overwritten; give another name")
+    if not target.parent.is_dir():
+        raise UserError(f"no directory {target.parent} to copy into")
+    shutil.copyfile(source, target)
+    print(f"copied to {target}; train with: pgkit run {target}")
+
+
+def run_recipe(args: argparse.Namespace) -> None:
+    if args.recipe in ("-h", "--help"):
+        print(
+            "usage: pgkit run RECIPE [FLAGS]\n\npgkit ls lists the recipes; pgkit run RECIPE --help lists a recipe's flags."
+        )
+        return
+    path = recipes.find(args.recipe)
+    sys.argv = [args.recipe, *args.flags]
+    sys.path.insert(0, str(path.resolve().parent))
+    runpy.run_path(str(path), run_name="__main__")
+
+
+def evaluate_run(args: argparse.Namespace) -> None:
+    from pgkit import run
+
+    policy = run.load_policy(args.run_dir, args.which)
+    env = policy.make_env(num_envs=min(args.episodes, 10), seed=args.seed)
+    try:
+        scores = run.evaluate(policy.actor, env, args.episodes)
+    finally:
+        env.close()
+    print(f"{args.run_dir}: {args.which} policy, after {policy.frames:,} frames, {args.episodes} episodes")
+    for name, value in scores.items():
+        print(f"  {name.removeprefix('eval/'):<16} {value:.2f}")
+
+
+def plot_runs(args: argparse.Namespace) -> None:
+    from pgkit import run
+
+    out = args.out or (args.run_dirs[0] / "curve.png" if len(args.run_dirs) == 1 else Path("curves.png"))
+    run.plot(args.run_dirs, out)
+    print(f"wrote {out}")

@@ -1,0 +1,96 @@
+"""A run's directory and its ``config.json``."""
+
+import dataclasses
+import json
+import math
+import os
+import platform
+import subprocess
+import sys
+import time
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from pgkit.errors import UserError
+from pgkit.run.settings import RunArgs
+
+PACKAGES = ("pgkit", "torch", "torchrl", "tensordict", "numpy", "gymnasium", "mujoco", "dm-control", "shimmy")
+
+
+def choose(args: RunArgs, recipe: str) -> Path:
+    """The directory that the settings ask for; a UserError if it already holds a run. Writes nothing."""
+    if args.resume:
+        return args.resume
+    name = f"{args.env_id.replace('/', '-')}__{recipe}__{args.seed}__{time.strftime('%Y%m%d-%H%M%S')}"
+    path = args.run_dir or Path("runs") / name
+    if path.exists() and not path.is_dir():
+        raise UserError(f"--run-dir {path} is a file; give a directory")
+    if holds_run(path):
+        raise UserError(
+            f"{path} already holds a run: give another --run-dir, or go on with it by --resume {path}"
+        )
+    return path
+
+
+def holds_run(path: Path) -> bool:
+    """Whether anything that a run writes is there."""
+    return any((path / name).exists() for name in ("config.json", "metrics.csv", "checkpoints"))
+
+
+def write_config(path: Path, args: RunArgs, recipe: str, resumed_at: list[int]) -> None:
+    """Write ``config.json``: recipe, resolved settings, versions, git revision, and the frames of each resume.
+
+    A new run claims the directory by creating the file; if another run got there first this is a UserError.
+    """
+    config = {
+        "recipe": recipe,
+        "settings": dataclasses.asdict(args) | {"run_dir": path, "resume": None},
+        "command": sys.argv,
+        "versions": versions(),
+        "git_revision": git_revision(),
+        "resumed_at": resumed_at,
+    }
+    path.mkdir(parents=True, exist_ok=True)
+    if not resumed_at:
+        try:
+            (path / "config.json").touch(exist_ok=False)
+        except FileExistsError:
+            raise UserError(f"{path} already holds a run: give another --run-dir") from None
+    write_json(path / "config.json", config)
+
+
+def read_config(path: Path) -> dict[str, Any]:
+    """``config.json`` of a run directory; a UserError if there is none."""
+    if not (path / "config.json").is_file():
+        raise UserError(f"{path} is not a run directory: it has no config.json")
+    return json.loads((path / "config.json").read_text())
+
+
+def write_json(path: Path, content: dict[str, Any]) -> None:
+    """Write JSON in one step; NaN and infinity, which JSON does not have, become null."""
+    plain = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in content.items()}
+    temporary = path.with_name(path.name + ".tmp")
+    temporary.write_text(json.dumps(plain, indent=2, default=str) + "\n")
+    os.replace(temporary, path)
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of the packages that can change a run's numbers."""
+    found = {"python": platform.python_version()}
+    for name in PACKAGES:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    return found
+
+
+def git_revision() -> str | None:
+    """Revision of the working directory, with ``-dirty`` for uncommitted changes; None outside a repository."""
+    command = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=10)
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return done.stdout.strip() or None if done.returncode == 0 else None

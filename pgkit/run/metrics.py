@@ -1,0 +1,66 @@
+"""A run's numbers: ``metrics.csv`` with a header that may grow, and the same scalars for TensorBoard."""
+
+import csv
+import math
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+
+def read_csv(path: Path) -> tuple[list[str], list[dict[str, str]]]:
+    """The header and the rows of a metrics file, as text."""
+    with path.open(newline="") as file:
+        reader = csv.DictReader(file)
+        return list(reader.fieldnames or []), list(reader)
+
+
+def column(rows: list[dict[str, str]], name: str) -> list[tuple[int, float]]:
+    """``(frames, value)`` of every row in which ``name`` has a value."""
+    return [(int(row["frames"]), float(row[name])) for row in rows if row.get(name)]
+
+
+class Metrics:
+    """Appends rows to ``run_dir/metrics.csv`` and to TensorBoard.
+
+    ``upto``: keep only the rows of an earlier run with at most so many frames (the frames in the checkpoint).
+    """
+
+    def __init__(self, run_dir: Path, upto: int = 0):
+        from torch.utils.tensorboard import SummaryWriter
+
+        self.path = run_dir / "metrics.csv"
+        self.columns: list[str] = []
+        if self.path.exists():
+            self.columns, rows = read_csv(self.path)
+            self._rewrite([row for row in rows if int(row["frames"]) <= upto])
+        self._board = SummaryWriter(str(run_dir), purge_step=upto + 1 if upto else None)
+
+    def write(self, row: Mapping[str, Any]) -> None:
+        """Append one row; it starts with ``frames``. A name not seen before becomes a new column; NaN is left empty."""
+        text = {name: _text(value) for name, value in row.items()}
+        if new := [name for name in row if name not in self.columns]:
+            rows = read_csv(self.path)[1] if self.path.exists() else []
+            self.columns += new
+            self._rewrite([*rows, text])
+        else:
+            with self.path.open("a", newline="") as file:
+                csv.DictWriter(file, self.columns, restval="").writerow(text)
+        for name, value in row.items():
+            if text[name] and name != "frames":
+                self._board.add_scalar(name, value, row["frames"])
+
+    def _rewrite(self, rows: list[dict[str, str]]) -> None:
+        temporary = self.path.with_suffix(".tmp")
+        with temporary.open("w", newline="") as file:
+            writer = csv.DictWriter(file, self.columns, restval="")
+            writer.writeheader()
+            writer.writerows(rows)
+        os.replace(temporary, self.path)
+
+    def close(self) -> None:
+        self._board.close()
+
+
+def _text(value: float) -> str:
+    return "" if math.isnan(value) else str(value)

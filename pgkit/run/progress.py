@@ -1,0 +1,51 @@
+"""What a run shows while it trains: a live bar on a terminal, a line an evaluation on a pipe."""
+
+import math
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+
+class Live:
+    """Progress towards ``total`` frames, on standard output."""
+
+    def __init__(self, total: int, frames: int = 0):
+        columns = (
+            BarColumn(bar_width=24),
+            MofNCompleteColumn(),
+            TextColumn("return {task.fields[score]}"),
+            TextColumn("{task.fields[fps]} frames/s"),
+            TimeElapsedColumn(),
+            TextColumn("left"),
+            TimeRemainingColumn(),
+        )
+        console = Console()
+        self._bar = Progress(*columns, console=console, disable=not console.is_terminal)
+        self._task = self._bar.add_task("", total=total, completed=frames, score="-", fps="-")
+        self._bar.start()
+
+    def update(self, frames: int, score: float, fps: float) -> None:
+        """Show the latest mean return and speed."""
+        shown = {"score": _short(score, ".1f"), "fps": _short(fps, ",.0f")}
+        self._bar.update(self._task, completed=frames, **shown)
+
+    def line(self, text: str) -> None:
+        """Print a line: above the bar on a terminal, as it is on a pipe."""
+        if self._bar.disable:
+            print(text, flush=True)
+        else:
+            self._bar.console.print(text, highlight=False, markup=False, soft_wrap=True)
+
+    def close(self) -> None:
+        self._bar.stop()
+
+
+def _short(value: float, spec: str) -> str:
+    return "-" if math.isnan(value) else format(value, spec)

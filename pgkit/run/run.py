@@ -1,0 +1,253 @@
+"""One training run, as a recipe holds it: log a step, and evaluation and checkpoints follow when due."""
+
+import shlex
+import signal
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
+from statistics import mean, median
+from types import FrameType
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+
+from pgkit.errors import UserError
+from pgkit.run import checkpoint, directory, seeding
+from pgkit.run.clock import Clock
+from pgkit.run.evaluate import evaluate
+from pgkit.run.metrics import Metrics, column, read_csv
+from pgkit.run.plots import plot
+from pgkit.run.policy import describe_env
+from pgkit.run.progress import Live
+from pgkit.run.settings import RunArgs, recipe_target
+
+NAN = float("nan")
+
+
+class Run:
+    """Seeds on entry, writes the run directory, ends with an evaluation, a summary and a curve.
+
+    Nothing is written before :meth:`track`, so a bad setting leaves no directory behind. Ctrl-C lets the running
+    update finish, saves ``latest`` and ends the run; a second Ctrl-C ends it at once.
+
+    Raises:
+        UserError: the directory holds a run; or the resumed one has no checkpoint, is another recipe's, or has
+            already trained for ``total_frames``.
+    """
+
+    def __init__(self, args: RunArgs, recipe: str):
+        self.args, self.recipe = args, recipe
+        self.dir = directory.choose(args, recipe)
+        self._saved = self._load() if args.resume else None
+        counters = self._saved["counters"] if self._saved else {}
+        self.frames: int = self._saved["frames"] if self._saved else 0
+        self.best: dict[str, float] = counters.get("best", {})
+        self._evaluated: dict[str, float] = counters.get("evaluated", {})
+        self._episodes = deque[tuple[float, int]](counters.get("episodes", ()), maxlen=100)
+        self._clock = Clock(already=counters.get("wall_s", 0.0))
+        self._tracked: dict[str, checkpoint.Stateful] = {}
+        self._eval: Any = None
+        self._interrupted = False
+
+    def _load(self) -> dict[str, Any]:
+        config = directory.read_config(self.dir)
+        if config["recipe"] != self.recipe:
+            raise UserError(
+                f"{self.dir} holds a run of {config['recipe']}, not of {self.recipe}: resume it with that recipe"
+            )
+        saved = checkpoint.load(self.dir / "checkpoints" / "latest.pt")
+        if self.args.total_frames <= saved["frames"]:
+            raise UserError(
+                f"{self.dir} has already trained {saved['frames']} frames: give a --total-frames above that"
+            )
+        return saved
+
+    def __enter__(self) -> "Run":
+        torch.set_num_threads(self.args.threads)
+        seeding.seed_everything(self.args.seed)
+        if threading.current_thread() is threading.main_thread():
+            self._handler = signal.signal(signal.SIGINT, self._interrupt)
+        return self
+
+    def track(
+        self, *, policy: torch.nn.Module, eval_env: Callable[..., Any], **stateful: checkpoint.Stateful
+    ) -> None:
+        """Name what to evaluate and what to save; on a resume, load the checkpoint into it.
+
+        Args:
+            policy: the actor; reads ``observation``, writes ``action``.
+            eval_env: picklable; ``eval_env(num_envs=, seed=)`` makes the evaluation's own env.
+            stateful: whatever else the run must restore (update, collector, normalizer, ...).
+        """
+        self._tracked = {"policy": policy, **stateful}
+        self._policy, self._make_env = policy, eval_env
+        resumed_at = []
+        if self._saved:
+            checkpoint.restore(self._tracked, self._saved["states"], self.dir / "checkpoints" / "latest.pt")
+            seeding.set_rng_state(self._saved["rng"])
+            resumed_at = [*directory.read_config(self.dir)["resumed_at"], self.frames]
+        directory.write_config(self.dir, self.args, self.recipe, resumed_at)
+        self._metrics = Metrics(self.dir, upto=self.frames)
+        self._live = Live(self.args.total_frames, self.frames)
+        self._clock.restart(self.frames)
+
+    def step(
+        self,
+        frames: int,
+        rollout: TensorDictBase | None = None,
+        metrics: Mapping[str, float] | None = None,
+        compile_seconds: float = 0.0,
+        episodes: Iterable[tuple[float, int]] = (),
+    ) -> None:
+        """Log one update as a row of ``metrics.csv``; evaluate and save when due.
+
+        Args:
+            frames: env steps taken so far, all envs together.
+            rollout: ``[num_envs, T]``; its finished episodes enter the mean of the last 100.
+            metrics: logged as ``train/<name>``, or as they are if the name holds a ``/``.
+            compile_seconds: seconds this process has spent compiling so far; left out of ``time/fps``.
+            episodes: finished episodes as ``(return, length)``, for a recipe without such rollouts.
+        """
+        if not self._tracked:
+            raise RuntimeError("call track(policy=..., eval_env=...) before the first step(...)")
+        self._episodes.extend(finished_episodes(rollout))
+        self._episodes.extend(episodes)
+        due = frames >= self.args.total_frames
+        if self.args.eval_every:
+            due |= frames // self.args.eval_every > self.frames // self.args.eval_every
+        self.frames = frames
+        row: dict[str, float] = {
+            "frames": frames,
+            "time/fps": self._clock.fps(frames, compile_seconds),
+            "time/wall_s": self._clock.wall,
+            "rollout/ep_rew_mean": mean(reward for reward, _ in self._episodes) if self._episodes else NAN,
+            "rollout/ep_len_mean": mean(length for _, length in self._episodes) if self._episodes else NAN,
+        }
+        row |= {
+            name if "/" in name else f"train/{name}": float(value) for name, value in (metrics or {}).items()
+        }
+        self._live.update(frames, row["rollout/ep_rew_mean"], row["time/fps"])
+        if due:
+            row |= self._evaluate(row)
+        self._metrics.write(row)
+        if due or self._interrupted:
+            self.save()
+        if self._interrupted:
+            raise KeyboardInterrupt
+
+    def _evaluate(self, row: Mapping[str, float]) -> dict[str, float]:
+        with self._clock.paused(), seeding.preserved_rng():
+            seed = seeding.evaluation_seed(self.args.seed, self.frames)
+            if self._eval is None:
+                self._eval = self._make_env(num_envs=min(self.args.eval_episodes, 10), seed=seed)
+            self._eval.set_seed(seed)
+            scores = evaluate(self._policy, self._eval, self.args.eval_episodes)
+            self._evaluated = {"frames": self.frames, **scores}
+            if scores["eval/mean_reward"] > self.best.get("eval/mean_reward", -float("inf")):
+                self.best = self._evaluated
+        self._live.line(
+            f"frames {self.frames:>10,}  return {row.get('rollout/ep_rew_mean', NAN):9.1f}  "
+            f"eval {scores['eval/mean_reward']:9.1f} ± {scores['eval/std_reward']:.1f}  {row.get('time/fps', NAN):8,.0f} frames/s"
+        )
+        return scores
+
+    def save(self) -> None:
+        """Save ``latest`` (and ``best``, if the evaluation just made is) to ``checkpoints/``."""
+        with self._clock.paused():
+            folder = self.dir / "checkpoints"
+            if not (folder / "policy.pt").exists():
+                with seeding.preserved_rng():
+                    shape = describe_env(self._eval or self._make_env(num_envs=1, seed=self.args.seed))
+                checkpoint.save(
+                    folder / "policy.pt", {"actor": self._policy, "make_env": self._make_env, **shape}
+                )
+            content = {
+                "recipe": self.recipe,
+                "frames": self.frames,
+                "states": {name: owner.state_dict() for name, owner in self._tracked.items()},
+                "rng": seeding.rng_state(),
+                "counters": {
+                    "best": self.best,
+                    "evaluated": self._evaluated,
+                    "episodes": list(self._episodes),
+                    "wall_s": self._clock.wall,
+                },
+            }
+            checkpoint.save(folder / "latest.pt", content)
+            if self.best.get("frames") == self.frames:
+                checkpoint.save(folder / "best.pt", content)
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGINT, self._handler)
+        if not self._tracked:
+            return
+        try:
+            if kind is None:
+                self._finish()
+        finally:
+            self._live.close()
+            self._metrics.close()
+            if self._eval is not None:
+                self._eval.close()
+        if kind is None or (kind is KeyboardInterrupt and (self.dir / "checkpoints" / "latest.pt").exists()):
+            self._say_how_to_go_on()
+
+    def _interrupt(self, number: int, frame: FrameType | None) -> None:
+        if self._interrupted or not self._tracked:
+            raise KeyboardInterrupt
+        self._interrupted = True
+        self._live.line("stopping after this update; press Ctrl-C again to stop at once")
+
+    def _finish(self) -> None:
+        if self._evaluated.get("frames") != self.frames:
+            scores = self._evaluate({})
+            self._metrics.write({"frames": self.frames, "time/wall_s": self._clock.wall, **scores})
+            self.save()
+        rows = read_csv(self.dir / "metrics.csv")[1]
+        fps = [value for _, value in column(rows, "time/fps")]
+        returns = column(rows, "rollout/ep_rew_mean")
+        summary = {
+            "recipe": self.recipe,
+            "env_id": self.args.env_id,
+            "seed": self.args.seed,
+            **self._evaluated,
+            "frames": self.frames,
+            "wall_s": self._clock.wall,
+            "time/fps": median(warm(fps)) if fps else NAN,
+            "rollout/ep_rew_mean": returns[-1][1] if returns else NAN,
+            "best/mean_reward": self.best.get("eval/mean_reward", NAN),
+            "best/frames": self.best.get("frames", 0),
+        }
+        directory.write_json(self.dir / "summary.json", summary)
+        plot([self.dir], self.dir / "curve.png")
+
+    def _say_how_to_go_on(self) -> None:
+        where = shlex.quote(str(self.dir))
+        total = self.args.total_frames * (2 if self.frames >= self.args.total_frames else 1)
+        print(
+            f"run directory: {self.dir}\n"
+            f"  resume    pgkit run {recipe_target(self.recipe)} --resume {where} --total-frames {total}\n"
+            f"  evaluate  pgkit eval {where}\n"
+            f"  plot      pgkit plot {where}"
+        )
+
+
+def finished_episodes(rollout: TensorDictBase | None) -> list[tuple[float, int]]:
+    """``(return, length)`` of the episodes that end in a rollout ``[num_envs, T]``, oldest first.
+
+    A rollout without TorchRL's ``episode_reward`` and ``step_count`` entries has none.
+    """
+    if rollout is None or ("next", "episode_reward") not in rollout.keys(include_nested=True):
+        return []
+    done = rollout["next", "done"].squeeze(-1).T
+    rewards, lengths = (
+        rollout["next", name].squeeze(-1).T[done] for name in ("episode_reward", "step_count")
+    )
+    return list(zip(rewards.tolist(), lengths.tolist(), strict=True))
+
+
+def warm(fps: list[float]) -> list[float]:
+    """The rows after warm-up: without the first tenth, at least without the first two, if others remain."""
+    return fps[min(max(2, len(fps) // 10), len(fps) - 1) :]

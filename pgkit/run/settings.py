@@ -1,0 +1,143 @@
+"""The flags that every recipe has, and the way from the command line to a recipe's ``main``."""
+
+import argparse
+import dataclasses
+import json
+import shlex
+import sys
+import typing
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+from pgkit.errors import UserError
+
+
+@dataclass
+class RunArgs:
+    """Settings of a run; a recipe's ``Args`` derives from it and adds the algorithm's own."""
+
+    env_id: str = "CartPole-v1"
+    """Gymnasium id, or dm_control/<domain>-<task>-v0."""
+    seed: int = 1
+    """Seeds the networks, the envs and the order of minibatches."""
+    total_frames: int = 100_000
+    """Env steps to train for, all envs together."""
+    num_envs: int = 8
+    """Envs stepped side by side."""
+    workers: int = 1
+    """Processes that the envs are spread over; the numbers stay the same."""
+    run_dir: Path | None = None
+    """Where to write the run (default: runs/{env}__{recipe}__{seed}__{time})."""
+    eval_every: int = 50_000
+    """Evaluate and save a checkpoint every so many frames; 0 = only at the end."""
+    eval_episodes: int = 10
+    """Whole episodes, with deterministic actions, in each evaluation."""
+    compile: Literal["auto", "on", "off"] = "auto"
+    """Compile the update into one graph; auto: when the run is long enough to win the compile time back."""
+    resume: Path | None = None
+    """Run directory to go on with: its settings are taken over, other flags given here override them."""
+    threads: int = 1
+    """Threads that PyTorch uses in this process; 1 is fastest for small networks."""
+
+
+A = TypeVar("A", bound=RunArgs)
+Presets = Mapping[str, Mapping[str, Any]]
+
+
+def launch(
+    main: Callable[[A], None],
+    args_class: type[A],
+    presets: Presets | None = None,
+    argv: Sequence[str] | None = None,
+) -> None:
+    """Parse the flags and call ``main(args)``: exit 2 and one line on a UserError, 130 on Ctrl-C.
+
+    Args:
+        presets: env id pattern (as in a shell: ``dm_control/*``) -> settings; the first match is used.
+        argv: the flags, without the program's name (default: ``sys.argv[1:]``).
+    """
+    try:
+        main(parse(args_class, presets or {}, sys.argv[1:] if argv is None else argv))
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        sys.exit(130)
+
+
+def parse(args_class: type[A], presets: Presets, argv: Sequence[str]) -> A:
+    """Settings in rising order of weight: the dataclass's defaults, the env's preset or the resumed run's, the flags."""
+    import tyro
+
+    peek = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    peek.add_argument("--env-id", "--env_id", nargs="?")
+    peek.add_argument("--resume", nargs="?", type=Path)
+    given = peek.parse_known_args(argv)[0]
+    defaults = args_class()
+    if given.resume:
+        pattern, preset = "", _saved_settings(args_class, given.resume)
+    else:
+        pattern, preset = _first_match(presets, given.env_id or defaults.env_id)
+    base = dataclasses.replace(defaults, **preset)
+    args = tyro.cli(
+        args_class, default=base, args=list(argv), prog=_program(), description=main_doc(args_class)
+    )
+    if given.resume:
+        _check_resumed(base, args)
+    elif shown := [f"{name}={value}" for name, value in preset.items() if getattr(args, name) == value]:
+        print(f"preset {pattern}: {' '.join(shown)}")
+    return args
+
+
+def main_doc(args_class: type[RunArgs]) -> str:
+    """The first line of the recipe's module docstring."""
+    module = sys.modules.get(args_class.__module__)
+    return next(iter((getattr(module, "__doc__", None) or "").strip().splitlines()), "")
+
+
+def recipe_target(recipe: str) -> str:
+    """What ``pgkit run`` takes to run this recipe again: the script that runs now, or the shipped recipe's name."""
+    return shlex.quote(sys.argv[0]) if sys.argv[0].endswith(".py") else recipe
+
+
+def _program() -> str:
+    return f"pgkit run {recipe_target(Path(sys.argv[0]).name)}"
+
+
+def _first_match(presets: Presets, env_id: str) -> tuple[str, dict[str, Any]]:
+    for pattern, values in presets.items():
+        if fnmatchcase(env_id, pattern):
+            return pattern, {"env_id": env_id, **values}
+    return "", {"env_id": env_id}
+
+
+def _saved_settings(args_class: type[RunArgs], run_dir: Path) -> dict[str, Any]:
+    """The settings in ``run_dir/config.json``, back in the types of the dataclass."""
+    path = run_dir / "config.json"
+    if not path.is_file():
+        raise UserError(f"--resume {run_dir}: no config.json there, so it is not a run directory")
+    saved, hints = json.loads(path.read_text())["settings"], typing.get_type_hints(args_class)
+    if unknown := saved.keys() - hints.keys():
+        raise UserError(
+            f"--resume {run_dir}: this recipe has no setting {', '.join(sorted(unknown))}; resume with its own"
+        )
+    saved |= {"run_dir": str(run_dir), "resume": str(run_dir)}
+    return {name: _typed(value, hints[name]) for name, value in saved.items()}
+
+
+def _typed(value: Any, hint: Any) -> Any:
+    kinds = typing.get_args(hint) or (hint,)
+    if isinstance(value, str) and Path in kinds and str not in kinds:
+        return Path(value)
+    return tuple(value) if isinstance(value, list) and "tuple" in str(hint).lower() else value
+
+
+def _check_resumed(saved: RunArgs, args: RunArgs) -> None:
+    for name, why in {"env_id": "that run trains on", "run_dir": "a resumed run goes on in"}.items():
+        if getattr(args, name) != getattr(saved, name):
+            raise UserError(
+                f"--{name.replace('_', '-')} {getattr(args, name)}: {why} {getattr(saved, name)}; drop the flag"
+            )
