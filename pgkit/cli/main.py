@@ -100,7 +100,8 @@ def copy_recipe(args: argparse.Namespace) -> None:
 def run_recipe(args: argparse.Namespace) -> None:
     if args.recipe in ("-h", "--help"):
         print(
-            "usage: pgkit run RECIPE [FLAGS]\n\npgkit ls lists the recipes; pgkit run RECIPE --help lists a recipe's flags."
+            "usage: pgkit run RECIPE [FLAGS]\n\n"
+            "pgkit ls lists the recipes; pgkit run RECIPE --help lists a recipe's flags."
         )
         return
     path = recipes.find(args.recipe)

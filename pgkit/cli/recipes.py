@@ -8,7 +8,7 @@ from pgkit.errors import UserError
 
 
 def recipes_dir() -> Path:
-    """The shipped recipes: inside the installed package, or beside it in a source checkout or editable install."""
+    """The shipped recipes: inside the installed package, or beside it in a source checkout."""
     package = Path(__file__).resolve().parent.parent
     inside = package / "recipes"
     return inside if inside.is_dir() else package.parent / "recipes"

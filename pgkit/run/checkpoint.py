@@ -19,7 +19,7 @@ class Stateful(Protocol):
 
 
 def save(path: Path, content: Any) -> None:
-    """Write ``content`` to ``path``: a reader, or a crash, finds the old file or the new one, never half of one.
+    """Write ``content`` to ``path`` in one step: a crash leaves the old file or the new one, never half.
 
     Classes defined in the recipe itself are saved by value, so the file opens without the recipe.
     """
@@ -37,7 +37,7 @@ def load(path: Path) -> Any:
 
 
 def restore(tracked: dict[str, Stateful], states: dict[str, Any], where: Path) -> None:
-    """Load each state into the object of its name; a UserError names the one that is missing or does not fit."""
+    """Load each state into the object of its name; a UserError names one that is missing or does not fit."""
     if tracked.keys() != states.keys():
         held, asked = ", ".join(sorted(states)), ", ".join(sorted(tracked))
         raise UserError(

@@ -39,7 +39,7 @@ def holds_run(path: Path) -> bool:
 
 
 def write_config(path: Path, args: RunArgs, recipe: str, resumed_at: list[int]) -> None:
-    """Write ``config.json``: recipe, resolved settings, versions, git revision, and the frames of each resume.
+    """Write ``config.json``: recipe, resolved settings, versions, git revision, frames at each resume.
 
     A new run claims the directory by creating the file; if another run got there first this is a UserError.
     """
@@ -87,7 +87,7 @@ def versions() -> dict[str, str]:
 
 
 def git_revision() -> str | None:
-    """Revision of the working directory, with ``-dirty`` for uncommitted changes; None outside a repository."""
+    """Revision of the working directory, ``-dirty`` with uncommitted changes; None outside a repository."""
     command = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=10)

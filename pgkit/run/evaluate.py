@@ -35,12 +35,12 @@ def act(policy: torch.nn.Module, obs: np.ndarray, deterministic: bool = True) ->
 def play(policy: torch.nn.Module, env: Any, episodes: int) -> tuple[np.ndarray, np.ndarray]:
     """Returns and lengths of ``episodes`` whole episodes, each ``[episodes]``, ordered by env slot.
 
-    Every one of the env's N slots plays its own share (``episodes / N``) to the end. Taking whichever episodes
-    finish first would favour the short ones. The global random state and the policy's mode are left as found.
+    Every one of the env's N slots plays its own share (``episodes / N``) to the end: to take whichever
+    episodes finish first would favour the short ones. Global random state and the policy's mode are left as found.
 
     Args:
         policy: a TensorDict actor that reads ``observation`` and writes ``action``.
-        env: has ``.arrays`` with ``reset()``, ``step(action)``, ``obs``, ``episode_reward`` and ``step_count``.
+        env: has ``.arrays``: ``reset()``, ``step(action)``, ``obs``, ``episode_reward``, ``step_count``.
     """
     arrays = env.arrays
     with preserved_rng(), _eval_mode(policy):

@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from tensordict import TensorDictBase
+
 
 def read_csv(path: Path) -> tuple[list[str], list[dict[str, str]]]:
     """The header and the rows of a metrics file, as text."""
@@ -37,7 +39,7 @@ class Metrics:
         self._board = SummaryWriter(str(run_dir), purge_step=upto + 1 if upto else None)
 
     def write(self, row: Mapping[str, Any]) -> None:
-        """Append one row; it starts with ``frames``. A name not seen before becomes a new column; NaN is left empty."""
+        """Append one row, ``frames`` first. A new name becomes a new column; NaN is left empty."""
         text = {name: _text(value) for name, value in row.items()}
         if new := [name for name in row if name not in self.columns]:
             rows = read_csv(self.path)[1] if self.path.exists() else []
@@ -64,3 +66,22 @@ class Metrics:
 
 def _text(value: float) -> str:
     return "" if math.isnan(value) else str(value)
+
+
+def finished_episodes(rollout: TensorDictBase | None) -> list[tuple[float, int]]:
+    """``(return, length)`` of the episodes that end in a rollout ``[num_envs, T]``, oldest first.
+
+    A rollout without TorchRL's ``episode_reward`` and ``step_count`` entries has none.
+    """
+    if rollout is None or ("next", "episode_reward") not in rollout.keys(include_nested=True):
+        return []
+    done = rollout["next", "done"].squeeze(-1).T
+    rewards, lengths = (
+        rollout["next", name].squeeze(-1).T[done] for name in ("episode_reward", "step_count")
+    )
+    return list(zip(rewards.tolist(), lengths.tolist(), strict=True))
+
+
+def warm(fps: list[float]) -> list[float]:
+    """The rows after warm-up: without the first tenth, at least without the first two, if others remain."""
+    return fps[min(max(2, len(fps) // 10), len(fps) - 1) :]

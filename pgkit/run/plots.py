@@ -61,7 +61,7 @@ def mean_and_band(curves: Sequence[Curve]) -> tuple[np.ndarray, np.ndarray, np.n
     longest = max(curves, key=len)
     start, end = max(curve[0][0] for curve in curves), min(curve[-1][0] for curve in curves)
     frames = np.array([x for x, _ in longest if start <= x <= end])
-    values = np.array([np.interp(frames, *zip(*curve, strict=True)) for curve in curves])
+    values = np.array([np.interp(frames, [x for x, _ in curve], [y for _, y in curve]) for curve in curves])
     return frames, values.mean(axis=0), values.std(axis=0)
 
 

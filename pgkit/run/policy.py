@@ -40,7 +40,7 @@ class Policy:
         if not single and obs.shape[1:] != self.observation_shape:
             want = list(self.observation_shape)
             raise UserError(
-                f"predict got an observation of shape {list(obs.shape)}; the policy takes {want} or [N, *{want}]"
+                f"predict got an observation of shape {list(obs.shape)}; the policy takes {want} or a batch"
             )
         action = act(self.actor, obs[None] if single else obs, deterministic)
         if self.low is not None and self.high is not None:

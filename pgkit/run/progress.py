@@ -33,8 +33,7 @@ class Live:
 
     def update(self, frames: int, score: float, fps: float) -> None:
         """Show the latest mean return and speed."""
-        shown = {"score": _short(score, ".1f"), "fps": _short(fps, ",.0f")}
-        self._bar.update(self._task, completed=frames, **shown)
+        self._bar.update(self._task, completed=frames, score=_short(score, ".1f"), fps=_short(fps, ",.0f"))
 
     def line(self, text: str) -> None:
         """Print a line: above the bar on a terminal, as it is on a pipe."""

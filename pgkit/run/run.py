@@ -28,12 +28,12 @@ NAN = float("nan")
 class Run:
     """Seeds on entry, writes the run directory, ends with an evaluation, a summary and a curve.
 
-    Nothing is written before :meth:`track`, so a bad setting leaves no directory behind. Ctrl-C lets the running
-    update finish, saves ``latest`` and ends the run; a second Ctrl-C ends it at once.
+    Nothing is written before :meth:`track`, so a bad setting leaves no directory behind. Ctrl-C lets the
+    running update finish, saves ``latest`` and ends the run; a second Ctrl-C ends it at once.
 
     Raises:
-        UserError: the directory holds a run; or the resumed one has no checkpoint, is another recipe's, or has
-            already trained for ``total_frames``.
+        UserError: the directory holds a run; or the resumed one has no checkpoint, is another recipe's, or
+            has already trained for ``total_frames``.
     """
 
     def __init__(self, args: RunArgs, recipe: str):
@@ -54,7 +54,7 @@ class Run:
         config = directory.read_config(self.dir)
         if config["recipe"] != self.recipe:
             raise UserError(
-                f"{self.dir} holds a run of {config['recipe']}, not of {self.recipe}: resume it with that recipe"
+                f"{self.dir} holds a run of {config['recipe']}, not of {self.recipe}: use that recipe"
             )
         saved = checkpoint.load(self.dir / "checkpoints" / "latest.pt")
         if self.args.total_frames <= saved["frames"]:
@@ -146,9 +146,10 @@ class Run:
             self._evaluated = {"frames": self.frames, **scores}
             if scores["eval/mean_reward"] > self.best.get("eval/mean_reward", -float("inf")):
                 self.best = self._evaluated
+        reward, fps = row.get("rollout/ep_rew_mean", NAN), row.get("time/fps", NAN)
+        score = f"{scores['eval/mean_reward']:.1f} ± {scores['eval/std_reward']:.1f}"
         self._live.line(
-            f"frames {self.frames:>10,}  return {row.get('rollout/ep_rew_mean', NAN):9.1f}  "
-            f"eval {scores['eval/mean_reward']:9.1f} ± {scores['eval/std_reward']:.1f}  {row.get('time/fps', NAN):8,.0f} frames/s"
+            f"frames {self.frames:>10,}   return {reward:.1f}   eval {score}   {fps:,.0f} frames/s"
         )
         return scores
 

@@ -17,7 +17,7 @@ def seed_everything(seed: int) -> None:
 
 
 def evaluation_seed(seed: int, frames: int) -> int:
-    """The env seed of the evaluation after ``frames``: new each time, the same after a resume, never a training seed."""
+    """Env seed of the evaluation after ``frames``: new each time, the same after a resume."""
     return int(np.random.SeedSequence([seed, 0xE7A1, frames]).generate_state(1)[0] >> 1)
 
 

@@ -69,7 +69,7 @@ def launch(
 
 
 def parse(args_class: type[A], presets: Presets, argv: Sequence[str]) -> A:
-    """Settings in rising order of weight: the dataclass's defaults, the env's preset or the resumed run's, the flags."""
+    """Settings, each over the one before: dataclass defaults, the env's preset or the resumed run, flags."""
     import tyro
 
     peek = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
@@ -99,7 +99,7 @@ def main_doc(args_class: type[RunArgs]) -> str:
 
 
 def recipe_target(recipe: str) -> str:
-    """What ``pgkit run`` takes to run this recipe again: the script that runs now, or the shipped recipe's name."""
+    """What ``pgkit run`` takes to run this recipe again: the script running now, or a shipped name."""
     return shlex.quote(sys.argv[0]) if sys.argv[0].endswith(".py") else recipe
 
 
@@ -121,9 +121,7 @@ def _saved_settings(args_class: type[RunArgs], run_dir: Path) -> dict[str, Any]:
         raise UserError(f"--resume {run_dir}: no config.json there, so it is not a run directory")
     saved, hints = json.loads(path.read_text())["settings"], typing.get_type_hints(args_class)
     if unknown := saved.keys() - hints.keys():
-        raise UserError(
-            f"--resume {run_dir}: this recipe has no setting {', '.join(sorted(unknown))}; resume with its own"
-        )
+        raise UserError(f"--resume {run_dir}: this recipe has no setting {', '.join(sorted(unknown))}")
     saved |= {"run_dir": str(run_dir), "resume": str(run_dir)}
     return {name: _typed(value, hints[name]) for name, value in saved.items()}
 
@@ -138,6 +136,4 @@ def _typed(value: Any, hint: Any) -> Any:
 def _check_resumed(saved: RunArgs, args: RunArgs) -> None:
     for name, why in {"env_id": "that run trains on", "run_dir": "a resumed run goes on in"}.items():
         if getattr(args, name) != getattr(saved, name):
-            raise UserError(
-                f"--{name.replace('_', '-')} {getattr(args, name)}: {why} {getattr(saved, name)}; drop the flag"
-            )
+            raise UserError(f"--{name.replace('_', '-')} {getattr(args, name)}: {why} {getattr(saved, name)}")
