@@ -1,0 +1,47 @@
+"""A TensorDict actor as a plain function of tensors, for the inner stepping loop."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torch.fx.experimental.proxy_tensor import make_fx
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+
+Act = Callable[[Tensor], tuple[Tensor, ...]]
+
+
+def output_keys(actor: TensorDictModuleBase) -> list[NestedKey]:
+    """What a rollout keeps of an actor's outputs: its samples and their log-probabilities."""
+    samples = getattr(actor, "dist_sample_keys", None)
+    if not samples:
+        return list(actor.out_keys)
+    return [*samples, *[key for key in actor.log_prob_keys if key in actor.out_keys]]
+
+
+def trace(actor: TensorDictModuleBase, obs: Tensor) -> Act:
+    """A function from observations of the shape of ``obs`` to the tensors at :func:`output_keys`.
+
+    It is the actor's own sequence of tensor operations, recorded once (``make_fx``) and called without TensorDict:
+    the same numbers bit for bit, at about a quarter of the cost for a small network. Parameters and buffers are
+    referred to, not copied, so weights changed in place take effect. An actor that cannot be recorded (Python
+    control flow that depends on data) is called as it is.
+    """
+    keys = output_keys(actor)
+
+    def act(obs: Tensor) -> tuple[Tensor, ...]:
+        out = actor(TensorDict({"observation": obs}, batch_size=obs.shape[:1]))
+        return tuple(out[key] for key in keys)
+
+    with torch.no_grad(), torch.random.fork_rng(devices=[]), set_exploration_type(ExplorationType.RANDOM):
+        try:
+            return make_fx(act)(obs).forward
+        except RuntimeError as error:
+            if "proxy" not in str(error) and "trac" not in str(error):
+                raise
+            return act

@@ -1,0 +1,136 @@
+"""The fast collector: whole rollouts from a vector of environments, in one process or several."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+from pgkit.collectors.policy import Act, output_keys, trace
+from pgkit.collectors.stepping import allocate, fill
+from pgkit.collectors.workers import Workers
+from pgkit.envs import VectorEnv
+from pgkit.envs.arrays import episode_seed
+from pgkit.errors import UserError
+
+
+class VectorCollector:
+    """Iterates over rollouts: TensorDicts ``[num_envs, T]`` with TorchRL's keys, until ``total_frames``.
+
+    Besides ``observation``, the actor's samples and log-probabilities and the ``next`` entries, a rollout has
+    ``("next", "episode_reward")`` and ``("next", "step_count")``, return and length so far of the running episode.
+    ``("next", "observation")`` is the true final observation where an episode ended.
+
+    The numbers depend on the environment's seed and the weights only: not on ``env.workers``, not on the use made
+    of torch's global random generator elsewhere.
+
+    Args:
+        env: from :func:`pgkit.envs.make`; ``env.workers`` processes collect.
+        actor: TensorDict module from ``observation`` to ``action`` (and its log-probability). Its parameters are
+            read before every rollout.
+        frames_per_batch: frames of a rollout, a multiple of ``env.num_envs``.
+        total_frames: frames after which iteration stops (with the rollout that reaches them); -1: never.
+
+    Raises:
+        UserError: sizes that do not fit, or an actor that was built for another environment.
+    """
+
+    def __init__(
+        self, env: VectorEnv, actor: TensorDictModuleBase, *, frames_per_batch: int, total_frames: int = -1
+    ) -> None:
+        if frames_per_batch < 1 or frames_per_batch % env.num_envs:
+            raise UserError(
+                f"frames_per_batch={frames_per_batch} is not a multiple of the {env.num_envs} environments: each takes "
+                "the same number of steps"
+            )
+        if 0 <= total_frames < frames_per_batch:
+            raise UserError(
+                f"total_frames={total_frames} is less than one rollout (frames_per_batch={frames_per_batch}): raise the "
+                "first or lower the second"
+            )
+        self.env, self.actor = env, actor
+        self.frames_per_batch, self.total_frames = frames_per_batch, total_frames
+        self.frames = self._rollouts = 0
+        self._steps = frames_per_batch // env.num_envs
+        self._keys = output_keys(actor)
+        self._outputs = dict(zip(self._keys, _example(env, actor), strict=True))
+        self._workers: Workers | None = None
+        self._act: Act | None = None
+        self._traced: list[int] = []
+
+    def __iter__(self) -> Iterator[TensorDictBase]:
+        while self.total_frames < 0 or self.frames < self.total_frames:
+            yield self.rollout()
+
+    def rollout(self) -> TensorDictBase:
+        """Collects one rollout with the actor's present weights."""
+        seed = episode_seed(self.env.seed, -1 % 2**32, self._rollouts)
+        if self.env.workers > 1:
+            arrays = self._pool().collect(self.actor, seed)
+        else:
+            obs = self.env.arrays.obs
+            arrays = allocate(self._steps, obs, self._outputs)
+            with torch.random.fork_rng(devices=[]):
+                fill(arrays, self.env.arrays, self._policy(), self._keys, self.env.num_envs, seed)
+        self.frames += self.frames_per_batch
+        self._rollouts += 1
+        tensors = {key: torch.from_numpy(array).transpose(0, 1) for key, array in arrays.items()}
+        tensors["next", "done"] = tensors["next", "terminated"] | tensors["next", "truncated"]
+        rollout = TensorDict({}, batch_size=(self.env.num_envs, self._steps))
+        for key, tensor in tensors.items():
+            rollout.set(key, tensor)
+        return rollout
+
+    def state_dict(self) -> dict[str, Any]:
+        """Counters, and every environment's state (see :class:`~pgkit.envs.ArrayEnv`)."""
+        envs = self._pool() if self.env.workers > 1 else self.env.arrays
+        return {"frames": self.frames, "rollouts": self._rollouts, "envs": envs.state_dict()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restores :meth:`state_dict`, also one taken with another number of workers."""
+        self.frames, self._rollouts = state["frames"], state["rollouts"]
+        envs = self._pool() if self.env.workers > 1 else self.env.arrays
+        envs.load_state_dict(state["envs"])
+
+    def shutdown(self) -> None:
+        """Ends the worker processes and closes the environments."""
+        if self._workers is not None:
+            self._workers.close()
+            self._workers = None
+        self.env.close_arrays()
+
+    def _pool(self) -> Workers:
+        if self._workers is None:
+            self._workers = Workers(self.env, self.actor, self._steps, self._outputs)
+        return self._workers
+
+    def _policy(self) -> Act:
+        """The traced actor, traced again if its tensors are other ones than before (moved, or replaced)."""
+        tensors = [x.data_ptr() for x in (*self.actor.parameters(), *self.actor.buffers())]
+        if self._act is None or tensors != self._traced:
+            self._act, self._traced = trace(self.actor, torch.from_numpy(self.env.arrays.obs)), tensors
+        return self._act
+
+
+def _example(env: VectorEnv, actor: TensorDictModuleBase) -> tuple[Tensor, ...]:
+    """The actor's outputs for observations of zeros, checked against the environment's action spec."""
+    obs, spec = env.observation_spec["observation"].zero(), env.action_spec
+    data = TensorDict({"observation": obs}, batch_size=(env.num_envs,))
+    misfit = "the actor was built for another environment: build it from this one (modules.gaussian_actor(env))"
+    with torch.no_grad(), torch.random.fork_rng(devices=[]):
+        try:
+            out = actor(data)
+        except RuntimeError as error:
+            reason = str(error.__cause__ or error).strip().splitlines()[-1]
+            raise UserError(f"the actor cannot read observations of shape {tuple(obs.shape[1:])}; {misfit} [{reason}]") from error
+    action = out["action"]
+    if action.shape != spec.shape or action.dtype.is_floating_point != spec.dtype.is_floating_point:
+        raise UserError(
+            f"the actor's action is {tuple(action.shape[1:])} {action.dtype}, the environment's {tuple(spec.shape[1:])} "
+            f"{spec.dtype}; {misfit}"
+        )
+    return tuple(out[key] for key in output_keys(actor))

@@ -1,0 +1,129 @@
+"""Processes that each hold some environments and the policy, and collect their share of every rollout alone."""
+
+from __future__ import annotations
+
+import copy
+import traceback
+import weakref
+from multiprocessing.connection import Connection
+from typing import Any
+
+import cloudpickle
+import torch
+import torch.multiprocessing as mp
+from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+
+from pgkit.collectors.policy import output_keys, trace
+from pgkit.collectors.stepping import Arrays, allocate, fill
+from pgkit.envs import ArrayEnv, VectorEnv
+
+
+class Workers:
+    """``env.workers`` processes; :meth:`collect` returns one rollout's arrays.
+
+    The rollout and the policy's weights are in shared memory: a rollout costs two messages a process.
+    """
+
+    def __init__(self, env: VectorEnv, actor: TensorDictModuleBase, steps: int, outputs: dict[NestedKey, Tensor]) -> None:
+        self._actor = copy.deepcopy(actor).requires_grad_(False).share_memory()
+        obs = env.observation_spec["observation"].zero().numpy()
+        shared = {k: torch.from_numpy(x).share_memory_() for k, x in allocate(steps, obs, outputs).items()}
+        self._arrays: Arrays = {key: tensor.numpy() for key, tensor in shared.items()}
+        context = mp.get_context("spawn")
+        bounds = [round(i * env.num_envs / env.workers) for i in range(env.workers + 1)]
+        self._pipes: list[Connection] = []
+        processes = []
+        for first, end in zip(bounds, bounds[1:], strict=False):
+            ours, theirs = context.Pipe()
+            make_env = cloudpickle.dumps(env.make_env)
+            args = (theirs, make_env, first, end - first, env.num_envs, env.seed, self._actor, shared)
+            process = context.Process(target=_serve, args=args, daemon=True)
+            process.start()
+            theirs.close()
+            self._pipes.append(ours)
+            processes.append(process)
+        self._bounds = bounds
+        self.close = weakref.finalize(self, _stop, self._pipes, processes)
+        self._ask([None] * env.workers)  # the processes are up
+
+    def collect(self, actor: TensorDictModuleBase, seed: int) -> Arrays:
+        """Collects one rollout with the actor's present weights; arrays ``[T, N, ...]``, the caller's to keep."""
+        with torch.no_grad():
+            for mine, theirs in zip(self._actor.state_dict().values(), actor.state_dict().values(), strict=True):
+                mine.copy_(theirs)
+        self._ask([("collect", seed)] * len(self._pipes))
+        return {key: array.copy() for key, array in self._arrays.items()}
+
+    def state_dict(self) -> dict[str, Any]:
+        """The environments' state, as :class:`~pgkit.envs.ArrayEnv` would give it for all of them."""
+        parts = self._ask([("state", None)] * len(self._pipes))
+        history = [x for part in parts for x in part["history"]]
+        episode = [x for part in parts for x in part["episode"]]
+        return {"seed": parts[0]["seed"], "episode": episode, "history": history}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Gives every process its share of :meth:`state_dict`."""
+        cuts = [slice(a, b) for a, b in zip(self._bounds, self._bounds[1:], strict=False)]
+        parts = [{**state, "episode": state["episode"][c], "history": state["history"][c]} for c in cuts]
+        self._ask([("load", part) for part in parts])
+
+    def _ask(self, requests: list[Any]) -> list[Any]:
+        """Sends each process its request (None: none) and waits for all answers."""
+        for pipe, request in zip(self._pipes, requests, strict=True):
+            if request is not None:
+                pipe.send(request)
+        answers = []
+        for i, pipe in enumerate(self._pipes):
+            try:
+                answer, failure = pipe.recv()
+            except EOFError:
+                answer, failure = None, "the process ended (killed, or out of memory)"
+            if failure:
+                self.close()
+                raise RuntimeError(f"collector worker {i} failed:\n{failure}")
+            answers.append(answer)
+        return answers
+
+
+def _serve(
+    pipe: Connection,
+    make_env: bytes,
+    first: int,
+    count: int,
+    num_envs: int,
+    seed: int,
+    actor: TensorDictModuleBase,
+    shared: dict[NestedKey, Tensor],
+) -> None:
+    """A worker's life: answers ``(answer, failure)`` to every request until the pipe closes."""
+    try:
+        torch.set_num_threads(1)
+        envs = ArrayEnv(cloudpickle.loads(make_env), count, seed, first)
+        act = trace(actor, torch.zeros(num_envs, *envs.obs.shape[1:]))
+        arrays = {key: tensor.numpy() for key, tensor in shared.items()}
+        pipe.send((None, None))
+        while True:
+            request, argument = pipe.recv()
+            answer = None
+            if request == "collect":
+                fill(arrays, envs, act, output_keys(actor), num_envs, argument)
+            elif request == "state":
+                answer = envs.state_dict()
+            else:
+                envs.load_state_dict(argument)
+            pipe.send((answer, None))
+    except (EOFError, KeyboardInterrupt, BrokenPipeError):
+        pass
+    except Exception:
+        pipe.send((None, traceback.format_exc()))
+
+
+def _stop(pipes: list[Connection], processes: list[Any]) -> None:
+    for pipe in pipes:
+        pipe.close()
+    for process in processes:
+        process.join(timeout=5)
+        if process.is_alive():
+            process.kill()

@@ -1,0 +1,85 @@
+"""One id scheme for Gymnasium and dm_control."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import gymnasium as gym
+
+from pgkit.envs.vector import VectorEnv
+from pgkit.errors import UserError
+
+
+def make(
+    env_id: str | Callable[[], gym.Env], num_envs: int = 1, *, seed: int = 0, workers: int = 1, **kwargs: Any
+) -> VectorEnv:
+    """Makes a vector of environments.
+
+    Args:
+        env_id: a Gymnasium id, ``dm_control/<domain>-<task>-v0`` (also ``dmc:<domain>-<task>``), or a function
+            that makes one environment.
+        num_envs: number of environments.
+        seed: seed of the whole vector; environment ``i`` gets its own stream.
+        workers: processes that share the environments when a :class:`~pgkit.collectors.VectorCollector` collects.
+        **kwargs: passed to ``gymnasium.make``, or to the dm_control task.
+
+    Raises:
+        UserError: the id is unknown (the message has the nearest names), a package is missing (it has the
+            install line), or there are more workers than environments.
+    """
+    if num_envs < 1 or workers < 1 or workers > num_envs:
+        raise UserError(
+            f"num_envs={num_envs}, workers={workers}: every worker needs at least one environment; "
+            "choose 1 <= workers <= num_envs"
+        )
+    make_env = partial(make_one, env_id, **kwargs) if isinstance(env_id, str) else env_id
+    return VectorEnv(make_env, num_envs, seed, workers)
+
+
+def make_one(env_id: str, **kwargs: Any) -> gym.Env:
+    """Makes one environment; ids and errors as in :func:`make`."""
+    if env_id.startswith("dmc:"):
+        env_id = f"dm_control/{env_id.removeprefix('dmc:')}-v0"
+    try:
+        if env_id.startswith("dm_control/"):
+            return _make_dm_control(env_id, **kwargs)
+        return gym.make(env_id, disable_env_checker=True, **kwargs)
+    except (gym.error.UnregisteredEnv, gym.error.NamespaceNotFound) as error:
+        raise _unknown(env_id, list(gym.registry)) from error
+    except (gym.error.DependencyNotInstalled, ImportError) as error:
+        reason = str(error).splitlines()[0].rstrip(".")
+        raise UserError(
+            f"environment '{env_id}' needs a package that is not installed ({reason}): "
+            f'pip install "{_extra(env_id)}"'
+        ) from error
+
+
+def _make_dm_control(env_id: str, **kwargs: Any) -> gym.Env:
+    from dm_control import suite
+    from shimmy.dm_control_compatibility import DmControlCompatibilityV0
+
+    domain, _, task = env_id.removeprefix("dm_control/").removesuffix("-v0").partition("-")
+    tasks = [(d, t) for d, t in suite.ALL_TASKS]
+    if (domain, task) not in tasks:
+        raise _unknown(env_id, [f"dm_control/{d}-{t}-v0" for d, t in tasks])
+    return DmControlCompatibilityV0(suite.load(domain, task, task_kwargs=kwargs or None))
+
+
+def _unknown(env_id: str, known: list[str]) -> UserError:
+    nearest = difflib.get_close_matches(env_id, known, n=3, cutoff=0.4)
+    hint = f"; the nearest names are {', '.join(nearest)}" if nearest else "; see gymnasium.pprint_registry()"
+    return UserError(f"unknown environment id '{env_id}'{hint}")
+
+
+def _extra(env_id: str) -> str:
+    if env_id.startswith("dm_control/"):
+        return "shimmy[dm-control]"
+    spec = gym.registry.get(env_id)
+    entry = str(spec.entry_point) if spec else ""
+    for family in ("box2d", "mujoco", "toy_text", "classic_control"):
+        if family in entry:
+            return f"gymnasium[{family.replace('_', '-')}]"
+    return "ale-py" if env_id.startswith("ALE/") else "gymnasium[all]"

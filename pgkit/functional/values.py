@@ -1,0 +1,41 @@
+"""Losses of value functions, unreduced."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from pgkit.functional.checks import same_shape
+
+_DISTANCES = {"l2": F.mse_loss, "l1": F.l1_loss, "smooth_l1": F.smooth_l1_loss}
+
+
+def value_loss(value: Tensor, target: Tensor, kind: str = "l2") -> Tensor:
+    """Distance of a prediction from its target: ``l2`` (squared error, no factor 1/2), ``l1`` or ``smooth_l1``.
+
+    Same shape in and out; raises ``ValueError`` for two shapes or an unknown kind.
+    """
+    same_shape(value=value, target=target)
+    if kind not in _DISTANCES:
+        raise ValueError(f"unknown value loss '{kind}': choose one of {', '.join(_DISTANCES)}")
+    return _DISTANCES[kind](value, target, reduction="none")
+
+
+def clipped_value_loss(
+    value: Tensor, target: Tensor, old_value: Tensor, clip: float | Tensor, kind: str = "l2"
+) -> Tensor:
+    r"""The larger of the losses of :math:`V` and of :math:`V_{old} + \text{clip}(V - V_{old}, \pm\epsilon)`.
+
+    PPO's value clipping as in OpenAI's baselines; see Engstrom et al., 2020 (https://arxiv.org/abs/2005.12729)
+    for what it does. All of one shape, unreduced.
+    """
+    same_shape(value=value, old_value=old_value)
+    clipped = old_value + (value - old_value).clamp(-clip, clip)
+    return torch.maximum(value_loss(value, target, kind), value_loss(clipped, target, kind))
+
+
+def explained_variance(value: Tensor, target: Tensor) -> Tensor:
+    r""":math:`1 - \text{Var}(target - V) / \text{Var}(target)`: 1 is perfect, 0 no better than the mean. A scalar."""
+    same_shape(value=value, target=target)
+    return 1 - (target - value).var(correction=0) / target.var(correction=0).clamp_min(1e-12)

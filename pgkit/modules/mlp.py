@@ -1,0 +1,47 @@
+"""Multilayer perceptrons with per-layer orthogonal gains."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import nn
+
+
+def mlp(
+    in_features: int,
+    out_features: int | None,
+    hidden: Sequence[int] = (64, 64),
+    activation: type[nn.Module] = nn.Tanh,
+    *,
+    layer_norm: bool = False,
+    hidden_gain: float = 2**0.5,
+    out_gain: float = 1.0,
+) -> nn.Sequential:
+    """A multilayer perceptron, ``[*, in_features] -> [*, out_features]``, orthogonal weights and zero biases.
+
+    Args:
+        in_features: size of the input.
+        out_features: size of the output; None leaves the last hidden layer, activated, as the output (an encoder).
+        hidden: sizes of the hidden layers.
+        activation: class of the activation.
+        layer_norm: normalize before each activation.
+        hidden_gain: gain of the hidden layers' orthogonal init.
+        out_gain: gain of the last layer's; 0.01 keeps a new policy close to uniform or to its mean (Andrychowicz
+            et al., 2021, https://arxiv.org/abs/2006.05990).
+    """
+    layers: list[nn.Module] = []
+    for size in hidden:
+        layers.append(orthogonal(nn.Linear(in_features, size), hidden_gain))
+        layers += [nn.LayerNorm(size), activation()] if layer_norm else [activation()]
+        in_features = size
+    if out_features is not None:
+        layers.append(orthogonal(nn.Linear(in_features, out_features), out_gain))
+    return nn.Sequential(*layers)
+
+
+def orthogonal(layer: nn.Linear, gain: float) -> nn.Linear:
+    """Initializes ``layer`` in place: orthogonal weight times ``gain``, zero bias."""
+    nn.init.orthogonal_(layer.weight, gain)
+    torch.nn.init.zeros_(layer.bias)
+    return layer

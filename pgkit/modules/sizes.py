@@ -1,0 +1,45 @@
+"""Sizes of observations and actions, read off an environment's TorchRL specs."""
+
+from __future__ import annotations
+
+from math import prod
+
+import torch
+from torchrl.data import Bounded, TensorSpec
+from torchrl.envs import EnvBase
+
+from pgkit.errors import UserError
+
+
+def observation_shape(env: EnvBase, key: str = "observation") -> torch.Size:
+    """Shape of one observation, without the environment's batch dimensions."""
+    spec = env.observation_spec_unbatched
+    if key not in spec.keys():
+        raise UserError(f"the environment has no observation '{key}', only {', '.join(map(str, spec.keys()))}")
+    return spec[key].shape
+
+
+def observation_size(env: EnvBase, key: str = "observation") -> int:
+    """Number of features of one flat observation."""
+    shape = observation_shape(env, key)
+    if len(shape) != 1:
+        raise UserError(
+            f"observation '{key}' has shape {tuple(shape)}, a perceptron needs a flat one: pass encoder= "
+            "(a module from that shape to features) or flatten it in the environment"
+        )
+    return shape[0]
+
+
+def box_action(env: EnvBase, needs_bounds: bool = False) -> TensorSpec:
+    """Spec of one continuous action; a ``UserError`` names the right builder otherwise."""
+    spec = env.action_spec_unbatched
+    if not spec.dtype.is_floating_point:
+        raise UserError(f"the action space is discrete ({spec.__class__.__name__}): use modules.categorical_actor")
+    if needs_bounds and not isinstance(spec, Bounded):
+        raise UserError("the action space has no bounds to squash into: use modules.gaussian_actor, or bound the Box")
+    return spec
+
+
+def action_size(env: EnvBase) -> int:
+    """Number of dimensions of one continuous action."""
+    return prod(box_action(env).shape)

@@ -1,0 +1,157 @@
+"""The update of on-policy methods: epochs of minibatches over one rollout."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+from torch.optim import Optimizer
+
+from pgkit.errors import UserError
+from pgkit.updates import wiring
+from pgkit.updates.step import GradientStep, worth_compiling
+
+
+class OnPolicyUpdate:
+    """``update(rollout) -> dict[str, float]``: advantage, then epochs of shuffled minibatches.
+
+    Args:
+        loss: any TorchRL ``LossModule``; the sum of its ``loss_*`` entries is minimized.
+        advantage: block that writes ``advantage`` and ``value_target`` into the rollout, pgkit's or TorchRL's; None
+            where the rollout has them or the loss needs none.
+        optimizer: any ``torch.optim`` optimizer over the parameters to train.
+        epochs: passes over the rollout.
+        minibatch_size: rows of a minibatch; the last of an epoch may be smaller. None: the whole rollout.
+        max_grad_norm: bound of the gradient's norm; None: no bound.
+        recompute_advantage: estimate the advantage again before every epoch (Andrychowicz et al., 2021).
+        normalize_advantage: standardize each minibatch's advantage here; for losses that do not do it themselves.
+        target_kl: stop after the epoch whose ``approx_kl`` (or ``kl_approx``) exceeds 1.5 times this.
+        schedules: name to function of the progress in [0, 1]; ``lr`` is the learning rate of all groups, any other
+            name an attribute of the loss such as ``entropy_coeff``. Needs ``total_frames``.
+        total_frames: frames of the whole training, for schedules and for ``compile="auto"``.
+        compile: ``on``, ``off``, or ``auto`` (see :func:`~pgkit.updates.step.worth_compiling`).
+        seed: of the minibatch order; by default drawn from torch's global generator.
+    """
+
+    def __init__(
+        self,
+        loss: nn.Module,
+        advantage: Callable[[TensorDictBase], TensorDictBase] | None,
+        optimizer: Optimizer,
+        *,
+        epochs: int = 10,
+        minibatch_size: int | None = 64,
+        max_grad_norm: float | None = 0.5,
+        recompute_advantage: bool = False,
+        normalize_advantage: bool = False,
+        target_kl: float | None = None,
+        schedules: Mapping[str, Callable[[float], float]] | None = None,
+        total_frames: int | None = None,
+        compile: str = "auto",
+        seed: int | None = None,
+    ) -> None:
+        if schedules and total_frames is None:
+            raise UserError("schedules are functions of the progress: give total_frames too")
+        if normalize_advantage and getattr(loss, "normalize_advantage", False):
+            raise UserError(f"{type(loss).__name__} normalizes the advantage already: leave normalize_advantage out here")
+        self.loss, self.advantage, self.optimizer = loss, advantage, optimizer
+        self.epochs, self.minibatch_size, self.max_grad_norm = epochs, minibatch_size, max_grad_norm
+        self.recompute_advantage, self.normalize_advantage = recompute_advantage, normalize_advantage
+        self.target_kl, self.schedules, self.total_frames = target_kl, dict(schedules or {}), total_frames
+        self.compile, self.frames = compile, 0
+        self._generator = torch.Generator().manual_seed(int(torch.randint(2**62, ())) if seed is None else seed)
+        self._step: GradientStep | None = None
+
+    def __call__(self, rollout: TensorDictBase) -> dict[str, float]:
+        """Trains on a rollout ``[num_envs, T]`` (or any batch shape); metrics are means over the minibatches."""
+        self._follow_schedules()
+        rows = rollout.numel()
+        size = min(self.minibatch_size or rows, rows)
+        results: list[Tensor] = []
+        flat, epoch = rollout, 0
+        for epoch in range(1, self.epochs + 1):
+            if epoch == 1 or self.recompute_advantage:
+                flat = self._flatten(rollout)
+            if self._step is None:
+                self._step = self._assemble(flat, size, rows)
+            if epoch == 1:
+                self._step.begin()
+            order = torch.randperm(rows, generator=self._generator).to(flat.device or "cpu")
+            start = len(results)
+            for index in order.split(size):
+                results.append(self._step(flat, index) if len(index) == size else self._step.eager(flat, index))
+            if self.target_kl is not None and self._kl(results[start:]) > 1.5 * self.target_kl:
+                break
+        self.frames += rows
+        assert self._step is not None
+        means = torch.stack(results).mean(0).tolist()
+        metrics = dict(zip(self._step.names, means, strict=True))
+        return metrics | {"epochs": float(epoch), "learning_rate": float(self.optimizer.param_groups[0]["lr"])}
+
+    @property
+    def compile_seconds(self) -> float:
+        """Seconds spent compiling so far."""
+        return 0.0 if self._step is None else self._step.compile_seconds
+
+    def state_dict(self) -> dict[str, Any]:
+        """Networks, coefficients, optimizer, statistics of the advantage block, minibatch order and frame count."""
+        return {
+            "loss": self.loss.state_dict(),
+            "advantage": self.advantage.state_dict() if isinstance(self.advantage, nn.Module) else {},
+            "optimizer": self.optimizer.state_dict(),
+            "generator": self._generator.get_state(),
+            "frames": self.frames,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restores :meth:`state_dict`; the compiled step is built again at the next call."""
+        self.loss.load_state_dict(state["loss"])
+        if isinstance(self.advantage, nn.Module):
+            self.advantage.load_state_dict(state["advantage"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        self._generator.set_state(state["generator"])
+        self.frames = state["frames"]
+        self._step = None
+
+    def _flatten(self, rollout: TensorDictBase) -> TensorDictBase:
+        """The advantage, then the entries that the loss reads as ``[rows, ...]``."""
+        if self.advantage is not None:
+            self.advantage(rollout)
+        return rollout.select(*wiring.read_keys(self.loss, rollout)).reshape(-1).contiguous()
+
+    def _assemble(self, flat: TensorDictBase, size: int, rows: int) -> GradientStep:
+        names = wiring.check(self.loss, self.advantage, self.optimizer, flat[:size])
+        per_rollout = self.epochs * -(-rows // size)
+        steps = None if self.total_frames is None else self.total_frames / rows * per_rollout
+        return GradientStep(
+            self.loss,
+            self.optimizer,
+            names,
+            max_grad_norm=self.max_grad_norm,
+            before=_standardize_advantage if self.normalize_advantage else None,
+            compile=worth_compiling(self.compile, steps),
+        )
+
+    def _follow_schedules(self) -> None:
+        for name, schedule in self.schedules.items():
+            value = schedule(self.frames / (self.total_frames or 1))
+            if name == "lr":
+                for group in self.optimizer.param_groups:
+                    group["lr"] = value
+            else:
+                getattr(self.loss, name).fill_(value)
+
+    def _kl(self, results: list[Tensor]) -> float:
+        assert self._step is not None
+        names = [name for name in ("approx_kl", "kl_approx") if name in self._step.names]
+        if not names:
+            raise UserError(f"target_kl needs a loss that reports approx_kl; {type(self.loss).__name__} does not")
+        return float(torch.stack(results).mean(0)[self._step.names.index(names[0])])
+
+
+def _standardize_advantage(batch: TensorDictBase) -> TensorDictBase:
+    advantage = batch["advantage"]
+    return batch.copy().set("advantage", (advantage - advantage.mean()) / advantage.std().clamp_min(1e-6))

@@ -1,0 +1,116 @@
+"""A ``torch.optim`` optimizer as a function of gradients, working on its own parameters and state.
+
+``Optimizer.step`` breaks a ``torch.compile`` graph on purpose; the functions under it do not. Each function here
+applies one such function to the tensors of the optimizer's own ``state``, so that ``optimizer.state_dict()`` is true
+at any time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.optim import SGD, Adam, AdamW, Optimizer, RMSprop
+from torch.optim.adam import adam
+from torch.optim.rmsprop import rmsprop
+from torch.optim.sgd import sgd
+
+Apply = Callable[[list[Tensor]], None]
+
+
+def parameters(optimizer: Optimizer) -> list[Tensor]:
+    """All parameters of the optimizer, in the order of its groups."""
+    return [p for group in optimizer.param_groups for p in group["params"]]
+
+
+def functional(optimizer: Optimizer, fused: bool) -> tuple[Apply, Callable[[], None]] | None:
+    """``(apply, read_learning_rates)`` for Adam, AdamW, SGD and RMSprop, or None for any other optimizer.
+
+    ``apply(grads)`` takes one gradient a parameter, in the order of :func:`parameters`, and can be traced.
+    ``read_learning_rates()`` copies the groups' ``lr`` into the tensors that the trace uses: annealing an ``lr`` never
+    recompiles. Adam moments and counters are made here if the optimizer has none yet.
+
+    Args:
+        optimizer: of exactly one of the classes above.
+        fused: use the fused kernel, which is fastest where nothing is compiled.
+    """
+    make = {Adam: _adam, AdamW: _adam, SGD: _sgd, RMSprop: _rmsprop}.get(type(optimizer))
+    if make is None or any(group.get("capturable") or group.get("differentiable") for group in optimizer.param_groups):
+        return None
+    groups = optimizer.param_groups
+    rates = [torch.as_tensor(g["lr"], dtype=g["params"][0].dtype, device=g["params"][0].device) for g in groups]
+    rates = [rate.clone() for rate in rates]
+    applies = [make(optimizer, group, rate, fused) for group, rate in zip(groups, rates, strict=True)]
+    sizes = [len(group["params"]) for group in groups]
+
+    def apply(grads: list[Tensor]) -> None:
+        start = 0
+        for size, apply_group in zip(sizes, applies, strict=True):
+            apply_group(grads[start : start + size])
+            start += size
+
+    def read_learning_rates() -> None:
+        for group, rate in zip(groups, rates, strict=True):
+            rate.copy_(torch.as_tensor(group["lr"]))
+
+    return apply, read_learning_rates
+
+
+def _state(optimizer: Optimizer, group: dict[str, Any], *names: str) -> list[list[Tensor]]:
+    """Lists of the named state tensors, one a parameter, made as the optimizer itself would at its first step."""
+    for p in group["params"]:
+        state = optimizer.state[p]
+        for name in names:
+            if state.get(name) is None:
+                step = torch.zeros((), dtype=torch.float32, device=p.device)
+                state[name] = step if name == "step" else torch.zeros_like(p, memory_format=torch.preserve_format)
+    return [[optimizer.state[p][name] for p in group["params"]] for name in names]
+
+
+def _adam(optimizer: Optimizer, group: dict[str, Any], lr: Tensor, fused: bool) -> Apply:
+    names = ["exp_avg", "exp_avg_sq", "step", *(["max_exp_avg_sq"] if group["amsgrad"] else [])]
+    averages, squares, steps, *maxima = _state(optimizer, group, *names)
+    beta1, beta2 = group["betas"]
+
+    def apply(grads: list[Tensor]) -> None:
+        adam(
+            group["params"], grads, averages, squares, maxima[0] if maxima else [], steps,
+            foreach=False, fused=fused, amsgrad=group["amsgrad"], beta1=beta1, beta2=beta2, lr=lr,
+            weight_decay=group["weight_decay"], eps=group["eps"], maximize=group["maximize"],
+            decoupled_weight_decay=group.get("decoupled_weight_decay", False),
+        )  # fmt: skip
+
+    return apply
+
+
+def _sgd(optimizer: Optimizer, group: dict[str, Any], lr: Tensor, fused: bool) -> Apply:
+    names = ["momentum_buffer"] if group["momentum"] else []
+    buffers = _state(optimizer, group, *names)
+
+    def apply(grads: list[Tensor]) -> None:
+        sgd(
+            group["params"], grads, buffers[0] if buffers else [None] * len(grads),
+            foreach=False, fused=False, weight_decay=group["weight_decay"], momentum=group["momentum"], lr=lr,
+            dampening=group["dampening"], nesterov=group["nesterov"], maximize=group["maximize"],
+        )  # fmt: skip
+
+    return apply
+
+
+def _rmsprop(optimizer: Optimizer, group: dict[str, Any], lr: Tensor, fused: bool) -> Apply:
+    names = ["square_avg", "step"]
+    names += ["momentum_buffer"] if group["momentum"] else []
+    names += ["grad_avg"] if group["centered"] else []
+    state = dict(zip(names, _state(optimizer, group, *names), strict=True))
+
+    def apply(grads: list[Tensor]) -> None:
+        rmsprop(
+            group["params"], grads, state["square_avg"], state.get("grad_avg", []), state.get("momentum_buffer", []),
+            state["step"], foreach=False, lr=lr, alpha=group["alpha"], eps=group["eps"],
+            weight_decay=group["weight_decay"], momentum=group["momentum"], centered=group["centered"],
+            maximize=group["maximize"],
+        )  # fmt: skip
+
+    return apply
