@@ -35,7 +35,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 def parser() -> Parser:
     """The command line's grammar."""
     top = Parser(prog="pgkit", description="Policy-gradient building blocks on TorchRL.", allow_abbrev=False)
-    top.add_argument("--version", action="version", version=f"pgkit {metadata.version('pgkit')}")
+    top.add_argument("--version", action="version", version=f"pgkit {version()}")
     commands = top.add_subparsers(required=True, metavar="COMMAND")
 
     command = commands.add_parser("ls", help="list the recipes")
@@ -46,13 +46,11 @@ def parser() -> Parser:
     command.add_argument("file", type=Path, help="where to; a file that exists is not overwritten")
     command.set_defaults(command=copy_recipe)
 
-    command = commands.add_parser(
-        "run", help="train with a recipe", usage="pgkit run RECIPE [FLAGS]", add_help=False
-    )
+    command = commands.add_parser("run", help="train with a recipe", usage="pgkit run RECIPE [FLAGS]")
     command.add_argument(
         "recipe", help="a name that pgkit ls shows, or a file; RECIPE --help lists its flags"
     )
-    command.add_argument("flags", nargs=argparse.REMAINDER)
+    command.add_argument("flags", nargs=argparse.REMAINDER, help="the recipe's own").required = False
     command.set_defaults(command=run_recipe)
 
     command = commands.add_parser("eval", help="play whole episodes with a trained policy")
@@ -71,6 +69,14 @@ def parser() -> Parser:
     )
     command.set_defaults(command=plot_runs)
     return top
+
+
+def version() -> str:
+    """The installed version; a source tree on the path that was never installed has none."""
+    try:
+        return metadata.version("pgkit")
+    except metadata.PackageNotFoundError:
+        return "(source tree, not installed)"
 
 
 def positive(text: str) -> int:
@@ -98,12 +104,6 @@ def copy_recipe(args: argparse.Namespace) -> None:
 
 
 def run_recipe(args: argparse.Namespace) -> None:
-    if args.recipe in ("-h", "--help"):
-        print(
-            "usage: pgkit run RECIPE [FLAGS]\n\n"
-            "pgkit ls lists the recipes; pgkit run RECIPE --help lists a recipe's flags."
-        )
-        return
     path = recipes.find(args.recipe)
     sys.argv = [args.recipe, *args.flags]
     sys.path.insert(0, str(path.resolve().parent))

@@ -32,8 +32,8 @@ def find(recipe: str) -> Path:
             raise UserError(f"no recipe file {recipe}; copy a shipped one with: pgkit cp ppo {recipe}")
         return path
     if recipe not in names():
-        close = difflib.get_close_matches(recipe, names(), cutoff=0.3) or names()
+        close = ", ".join(difflib.get_close_matches(recipe, names(), cutoff=0.3) or names())
         raise UserError(
-            f"no recipe named {recipe}; nearest: {', '.join(close)}; pgkit ls lists all, a file ends in .py"
+            f"no recipe named {recipe}; nearest: {close} (pgkit ls lists all; a file ends in .py)"
         )
     return recipes_dir() / f"{recipe}.py"

@@ -36,7 +36,7 @@ def play(policy: torch.nn.Module, env: Any, episodes: int) -> tuple[np.ndarray, 
     """Returns and lengths of ``episodes`` whole episodes, each ``[episodes]``, ordered by env slot.
 
     Every one of the env's N slots plays its own share (``episodes / N``) to the end: to take whichever
-    episodes finish first would favour the short ones. Global random state and the policy's mode are left as found.
+    episodes finish first would favour the short ones. The global random state and the policy's mode are kept.
 
     Args:
         policy: a TensorDict actor that reads ``observation`` and writes ``action``.

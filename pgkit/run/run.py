@@ -16,7 +16,7 @@ from pgkit.errors import UserError
 from pgkit.run import checkpoint, directory, seeding
 from pgkit.run.clock import Clock
 from pgkit.run.evaluate import evaluate
-from pgkit.run.metrics import Metrics, column, read_csv
+from pgkit.run.metrics import Metrics, column, finished_episodes, read_csv, warm
 from pgkit.run.plots import plot
 from pgkit.run.policy import describe_env
 from pgkit.run.progress import Live
@@ -136,13 +136,17 @@ class Run:
         if self._interrupted:
             raise KeyboardInterrupt
 
+    def _eval_env(self) -> Any:
+        if self._eval is None:
+            with seeding.preserved_rng():
+                self._eval = self._make_env(num_envs=min(self.args.eval_episodes, 10), seed=self.args.seed)
+        return self._eval
+
     def _evaluate(self, row: Mapping[str, float]) -> dict[str, float]:
         with self._clock.paused(), seeding.preserved_rng():
-            seed = seeding.evaluation_seed(self.args.seed, self.frames)
-            if self._eval is None:
-                self._eval = self._make_env(num_envs=min(self.args.eval_episodes, 10), seed=seed)
-            self._eval.set_seed(seed)
-            scores = evaluate(self._policy, self._eval, self.args.eval_episodes)
+            env = self._eval_env()
+            env.set_seed(seeding.evaluation_seed(self.args.seed, self.frames))
+            scores = evaluate(self._policy, env, self.args.eval_episodes)
             self._evaluated = {"frames": self.frames, **scores}
             if scores["eval/mean_reward"] > self.best.get("eval/mean_reward", -float("inf")):
                 self.best = self._evaluated
@@ -158,11 +162,9 @@ class Run:
         with self._clock.paused():
             folder = self.dir / "checkpoints"
             if not (folder / "policy.pt").exists():
-                with seeding.preserved_rng():
-                    shape = describe_env(self._eval or self._make_env(num_envs=1, seed=self.args.seed))
-                checkpoint.save(
-                    folder / "policy.pt", {"actor": self._policy, "make_env": self._make_env, **shape}
-                )
+                env = describe_env(self._eval_env())
+                actor = {"actor": self._policy, "make_env": self._make_env}
+                checkpoint.save(folder / "policy.pt", actor | env)
             content = {
                 "recipe": self.recipe,
                 "frames": self.frames,
@@ -230,25 +232,6 @@ class Run:
         print(
             f"run directory: {self.dir}\n"
             f"  resume    pgkit run {recipe_target(self.recipe)} --resume {where} --total-frames {total}\n"
-            f"  evaluate  pgkit eval {where}\n"
+            f"  evaluate  pgkit eval {where}{'' if self.best else ' --which latest'}\n"
             f"  plot      pgkit plot {where}"
         )
-
-
-def finished_episodes(rollout: TensorDictBase | None) -> list[tuple[float, int]]:
-    """``(return, length)`` of the episodes that end in a rollout ``[num_envs, T]``, oldest first.
-
-    A rollout without TorchRL's ``episode_reward`` and ``step_count`` entries has none.
-    """
-    if rollout is None or ("next", "episode_reward") not in rollout.keys(include_nested=True):
-        return []
-    done = rollout["next", "done"].squeeze(-1).T
-    rewards, lengths = (
-        rollout["next", name].squeeze(-1).T[done] for name in ("episode_reward", "step_count")
-    )
-    return list(zip(rewards.tolist(), lengths.tolist(), strict=True))
-
-
-def warm(fps: list[float]) -> list[float]:
-    """The rows after warm-up: without the first tenth, at least without the first two, if others remain."""
-    return fps[min(max(2, len(fps) // 10), len(fps) - 1) :]

@@ -80,7 +80,7 @@ def parse(args_class: type[A], presets: Presets, argv: Sequence[str]) -> A:
     if given.resume:
         pattern, preset = "", _saved_settings(args_class, given.resume)
     else:
-        pattern, preset = _first_match(presets, given.env_id or defaults.env_id)
+        pattern, preset = first_match(presets, given.env_id or defaults.env_id)
     base = dataclasses.replace(defaults, **preset)
     args = tyro.cli(
         args_class, default=base, args=list(argv), prog=_program(), description=main_doc(args_class)
@@ -107,11 +107,10 @@ def _program() -> str:
     return f"pgkit run {recipe_target(Path(sys.argv[0]).name)}"
 
 
-def _first_match(presets: Presets, env_id: str) -> tuple[str, dict[str, Any]]:
-    for pattern, values in presets.items():
-        if fnmatchcase(env_id, pattern):
-            return pattern, {"env_id": env_id, **values}
-    return "", {"env_id": env_id}
+def first_match(presets: Presets, env_id: str) -> tuple[str, Mapping[str, Any]]:
+    """The first pattern that fits the env id, and its settings; empty if none does."""
+    fitting = ((pattern, values) for pattern, values in presets.items() if fnmatchcase(env_id, pattern))
+    return next(fitting, ("", {}))
 
 
 def _saved_settings(args_class: type[RunArgs], run_dir: Path) -> dict[str, Any]:
@@ -119,18 +118,23 @@ def _saved_settings(args_class: type[RunArgs], run_dir: Path) -> dict[str, Any]:
     path = run_dir / "config.json"
     if not path.is_file():
         raise UserError(f"--resume {run_dir}: no config.json there, so it is not a run directory")
-    saved, hints = json.loads(path.read_text())["settings"], typing.get_type_hints(args_class)
+    config, hints = json.loads(path.read_text()), typing.get_type_hints(args_class)
+    saved = config["settings"]
     if unknown := saved.keys() - hints.keys():
-        raise UserError(f"--resume {run_dir}: this recipe has no setting {', '.join(sorted(unknown))}")
+        names = ", ".join(sorted(unknown))
+        raise UserError(
+            f"--resume {run_dir}: that is a run of {config['recipe']}; this recipe has no setting {names}"
+        )
     saved |= {"run_dir": str(run_dir), "resume": str(run_dir)}
     return {name: _typed(value, hints[name]) for name, value in saved.items()}
 
 
 def _typed(value: Any, hint: Any) -> Any:
-    kinds = typing.get_args(hint) or (hint,)
-    if isinstance(value, str) and Path in kinds and str not in kinds:
+    kinds = (hint, *typing.get_args(hint))
+    if isinstance(value, str) and Path in kinds:
         return Path(value)
-    return tuple(value) if isinstance(value, list) and "tuple" in str(hint).lower() else value
+    is_tuple = isinstance(value, list) and any(typing.get_origin(kind) is tuple for kind in kinds)
+    return tuple(value) if is_tuple else value
 
 
 def _check_resumed(saved: RunArgs, args: RunArgs) -> None:
