@@ -1,0 +1,58 @@
+"""TorchRL's collector behind pgkit's collector seam."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.collectors import Collector
+from torchrl.envs import Compose, EnvBase, RewardSum, StepCounter, TransformedEnv
+
+
+class TorchRLCollector:
+    """``torchrl.collectors.Collector`` as an iterable of rollouts that counts its frames.
+
+    For any TorchRL environment, transformed or not. It adds ``RewardSum`` and ``StepCounter``, which write the
+    ``("next", "episode_reward")`` and ``("next", "step_count")`` that finished episodes are read from.
+
+    Args:
+        env: any TorchRL environment, pgkit's included.
+        actor: TensorDict module that writes ``action``.
+        frames_per_batch: frames of a rollout over all environments.
+        total_frames: frames of the whole training; -1: endless.
+        **kwargs: passed to TorchRL's collector.
+    """
+
+    def __init__(
+        self,
+        env: EnvBase,
+        actor: TensorDictModuleBase,
+        *,
+        frames_per_batch: int,
+        total_frames: int = -1,
+        **kwargs: Any,
+    ) -> None:
+        env = TransformedEnv(env, Compose(RewardSum(), StepCounter()))
+        self.frames = 0
+        self.collector = Collector(
+            env, actor, frames_per_batch=frames_per_batch, total_frames=total_frames, trust_policy=True, **kwargs
+        )
+
+    def __iter__(self) -> Iterator[TensorDictBase]:
+        for rollout in self.collector:
+            self.frames += rollout.numel()
+            yield rollout
+
+    def state_dict(self) -> dict[str, Any]:
+        """Frames so far; TorchRL's environments start new episodes on a resume."""
+        return {"frames": self.frames}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restores :meth:`state_dict`."""
+        self.frames = state["frames"]
+
+    def shutdown(self) -> None:
+        """Ends TorchRL's collector."""
+        self.collector.shutdown()
