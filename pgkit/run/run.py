@@ -80,16 +80,16 @@ class Run:
             eval_env: picklable; ``eval_env(num_envs=, seed=)`` makes the evaluation's own env.
             stateful: whatever else the run must restore (update, collector, normalizer, ...).
         """
-        self._tracked = {"policy": policy, **stateful}
-        self._policy, self._make_env = policy, eval_env
+        tracked: dict[str, checkpoint.Stateful] = {"policy": policy, **stateful}
         resumed_at = []
         if self._saved:
-            checkpoint.restore(self._tracked, self._saved["states"], self.dir / "checkpoints" / "latest.pt")
+            checkpoint.restore(tracked, self._saved["states"], self.dir / "checkpoints" / "latest.pt")
             seeding.set_rng_state(self._saved["rng"])
             resumed_at = [*directory.read_config(self.dir)["resumed_at"], self.frames]
         directory.write_config(self.dir, self.args, self.recipe, resumed_at)
         self._metrics = Metrics(self.dir, upto=self.frames)
         self._live = Live(self.args.total_frames, self.frames)
+        self._policy, self._make_env, self._tracked = policy, eval_env, tracked
         self._clock.restart(self.frames)
 
     def step(

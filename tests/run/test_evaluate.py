@@ -1,0 +1,56 @@
+import random
+from types import SimpleNamespace
+
+import numpy as np
+import torch
+from tensordict import TensorDict
+from tensordict.nn import ProbabilisticTensorDictModule, TensorDictModule, TensorDictSequential
+from torch.distributions import Normal
+
+from pgkit import run
+
+
+class NoisyPolicy(torch.nn.Module):
+    """Draws from the global generators, and remembers in which mode it was called."""
+
+    def forward(self, td: TensorDict) -> TensorDict:
+        _ = random.random(), np.random.rand()
+        self.seen_training = self.training
+        return td.set("action", torch.rand(*td.batch_size, 1))
+
+
+def test_every_slot_plays_its_own_share(kit: SimpleNamespace):
+    # 3 slots with episodes of 1, 2 and 3 steps; rewards a step are the episode's number + the seed, 1.
+    # Of 5 episodes the slots 0 and 1 play two, slot 2 one. Taking the first five to finish would give
+    # slot 0 (length 1) three of them.
+    returns, lengths = run.play(kit.policy(), kit.Env(num_envs=3, seed=1), episodes=5)
+    assert lengths.tolist() == [1, 1, 2, 2, 3]
+    assert returns.tolist() == [1, 2, 2, 4, 3]
+
+
+def test_scores_are_mean_and_population_deviation(kit: SimpleNamespace):
+    scores = run.evaluate(kit.policy(), kit.Env(num_envs=2, seed=1), episodes=2)
+    # returns 1 and 2
+    assert scores == {"eval/mean_reward": 1.5, "eval/std_reward": 0.5, "eval/mean_ep_length": 1.5}
+
+
+def test_global_generators_and_mode_are_left_alone(kit: SimpleNamespace):
+    policy, env = NoisyPolicy(), kit.Env(num_envs=2, seed=0)
+    before = random.getstate(), np.random.get_state()[1].tolist(), torch.get_rng_state()  # pyright: ignore
+    run.play(policy, env, episodes=4)
+    assert random.getstate() == before[0]
+    assert np.random.get_state()[1].tolist() == before[1]  # pyright: ignore
+    assert torch.equal(torch.get_rng_state(), before[2])
+    assert policy.training and not policy.seen_training
+
+
+def test_actions_are_deterministic(kit: SimpleNamespace):
+    net = TensorDictModule(
+        lambda obs: (obs.sum(-1, keepdim=True) + 0.25, torch.ones(len(obs), 1)),
+        ["observation"],
+        ["loc", "scale"],
+    )
+    sample = ProbabilisticTensorDictModule(["loc", "scale"], ["action"], distribution_class=Normal)
+    env = kit.Env(num_envs=2, seed=0)
+    run.play(TensorDictSequential([net, sample]), env, episodes=2)
+    assert all((action == 0.25).all() for action in env.arrays.actions)

@@ -1,0 +1,170 @@
+import csv
+import json
+import os
+import signal
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+
+from pgkit.errors import UserError
+from pgkit.run import RunArgs
+
+Row = dict[str, str]
+
+
+def arguments(path: Path, total: int = 40, **settings: Any) -> RunArgs:
+    return RunArgs(env_id="Fake/Count-v0", run_dir=path, total_frames=total, eval_every=20, **settings)
+
+
+def rows(path: Path, timed: bool = False) -> list[Row]:
+    with (path / "metrics.csv").open(newline="") as file:
+        return [
+            {k: v for k, v in row.items() if timed or not k.startswith("time/")}
+            for row in csv.DictReader(file)
+        ]
+
+
+def test_a_run_leaves_what_the_design_promises(kit: SimpleNamespace, tmp_path: Path, capsys: Any):
+    path = tmp_path / "r"
+    kit.train(arguments(path))
+    config = json.loads((path / "config.json").read_text())
+    assert config["settings"]["total_frames"] == 40 and config["settings"]["run_dir"] == str(path)
+    assert config["recipe"] == "walk" and config["versions"]["torch"] == torch.__version__
+    assert "git_revision" in config
+    assert next(iter(rows(path, timed=True)[0])) == "frames"
+    assert {"time/fps", "time/wall_s"} < set(rows(path, timed=True)[0])
+    assert [row["rollout/ep_rew_mean"] for row in rows(path)] == ["10.0", "15.0", "20.0", "25.0"]
+    assert [row["eval/mean_reward"] != "" for row in rows(path)] == [False, True, False, True]
+    summary = json.loads((path / "summary.json").read_text())
+    assert summary["frames"] == 40 and summary["rollout/ep_rew_mean"] == 25.0 and summary["time/fps"] > 0
+    assert str(summary["eval/mean_reward"]) == rows(path)[-1]["eval/mean_reward"]
+    assert (path / "curve.png").read_bytes()[:4] == b"\x89PNG"
+    assert sorted(p.name for p in (path / "checkpoints").iterdir()) == ["best.pt", "latest.pt", "policy.pt"]
+    out = capsys.readouterr().out
+    assert out.count("frames/s") == 2  # one line an evaluation on a pipe
+    for command in (f"--resume {path} --total-frames 80", f"pgkit eval {path}", f"pgkit plot {path}"):
+        assert command in out
+
+
+def test_the_same_seed_gives_the_same_metrics_and_another_does_not(kit: SimpleNamespace, tmp_path: Path):
+    for name, seed in (("a", 1), ("b", 1), ("c", 2)):
+        kit.train(arguments(tmp_path / name, seed=seed))
+    assert rows(tmp_path / "a") == rows(tmp_path / "b") != rows(tmp_path / "c")
+
+
+def test_evaluating_does_not_change_the_training(kit: SimpleNamespace, tmp_path: Path):
+    kit.train(arguments(tmp_path / "often"))
+    seldom = arguments(tmp_path / "seldom")
+    seldom.eval_every = 0
+    kit.train(seldom)
+    assert [r["train/draw"] for r in rows(tmp_path / "often")] == [
+        r["train/draw"] for r in rows(tmp_path / "seldom")
+    ]
+
+
+def test_forty_frames_equal_twenty_and_twenty_more(kit: SimpleNamespace, tmp_path: Path):
+    kit.train(arguments(tmp_path / "whole"))
+    kit.train(arguments(tmp_path / "half", total=20))
+    kit.train(arguments(tmp_path / "half", resume=tmp_path / "half"))
+    assert rows(tmp_path / "whole") == rows(tmp_path / "half")
+    assert json.loads((tmp_path / "half/config.json").read_text())["resumed_at"] == [20]
+    whole, half = (json.loads((tmp_path / n / "summary.json").read_text()) for n in ("whole", "half"))
+    assert {k: v for k, v in whole.items() if not k.startswith(("time", "wall"))} == {
+        k: v for k, v in half.items() if not k.startswith(("time", "wall"))
+    }
+
+
+def test_rows_logged_after_the_checkpoint_are_dropped_on_resume(kit: SimpleNamespace, tmp_path: Path):
+    def crash(frames: int) -> None:
+        if frames == 30:
+            raise OSError("power cut")
+
+    kit.train(arguments(tmp_path / "whole"))
+    with pytest.raises(OSError, match="power cut"):
+        kit.train(arguments(tmp_path / "r"), hook=crash)
+    assert len(rows(tmp_path / "r")) == 3
+    kit.train(arguments(tmp_path / "r", resume=tmp_path / "r"))
+    assert rows(tmp_path / "r") == rows(tmp_path / "whole")
+
+
+def test_ctrl_c_finishes_the_step_saves_and_can_be_resumed(kit: SimpleNamespace, tmp_path: Path, capsys: Any):
+    def interrupt(frames: int) -> None:
+        if frames == 20:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    handler = signal.getsignal(signal.SIGINT)
+    kit.train(arguments(tmp_path / "whole"))
+    with pytest.raises(KeyboardInterrupt):
+        kit.train(arguments(tmp_path / "r"), hook=interrupt)
+    assert len(rows(tmp_path / "r")) == 3 and not (tmp_path / "r/summary.json").exists()
+    assert f"--resume {tmp_path / 'r'} --total-frames 40" in capsys.readouterr().out
+    assert signal.getsignal(signal.SIGINT) is handler
+    kit.train(arguments(tmp_path / "r", resume=tmp_path / "r"))
+    assert rows(tmp_path / "r") == rows(tmp_path / "whole")
+
+
+def test_a_directory_with_a_run_is_refused_and_stays_as_it_is(kit: SimpleNamespace, tmp_path: Path):
+    kit.train(arguments(tmp_path / "r"))
+    before = {p: p.read_bytes() for p in (tmp_path / "r").rglob("*") if p.is_file()}
+    with pytest.raises(UserError, match="already holds a run"):
+        kit.train(arguments(tmp_path / "r", seed=5))
+    assert {p: p.read_bytes() for p in (tmp_path / "r").rglob("*") if p.is_file()} == before
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"recipe": "other"}, "holds a run of walk, not of other"),
+        ({"total": 40}, "already trained 40 frames"),
+        ({"extra": {"second": torch.nn.Linear(1, 1)}}, "this recipe tracks counter, policy, second"),
+    ],
+)
+def test_a_resume_that_cannot_work_writes_nothing(
+    kit: SimpleNamespace, tmp_path: Path, change: dict[str, Any], message: str
+):
+    kit.train(arguments(tmp_path / "r"))
+    before = {p: p.read_bytes() for p in (tmp_path / "r").rglob("*") if p.is_file()}
+    args = arguments(tmp_path / "r", total=change.get("total", 80), resume=tmp_path / "r")
+    with pytest.raises(UserError, match=message):
+        kit.train(args, recipe=change.get("recipe", "walk"), **change.get("extra", {}))
+    assert {p: p.read_bytes() for p in (tmp_path / "r").rglob("*") if p.is_file()} == before
+
+
+def test_a_run_without_a_checkpoint_cannot_be_resumed(kit: SimpleNamespace, tmp_path: Path):
+    kit.train(arguments(tmp_path / "r"))
+    (tmp_path / "r/checkpoints/latest.pt").unlink()
+    with pytest.raises(UserError, match="has no checkpoint"):
+        kit.train(arguments(tmp_path / "r", total=80, resume=tmp_path / "r"))
+
+
+def test_an_error_before_track_leaves_no_directory(tmp_path: Path):
+    from pgkit.run import Run
+
+    with pytest.raises(UserError, match="no such env"), Run(arguments(tmp_path / "r"), "walk"):
+        raise UserError("no such env")
+    assert not (tmp_path / "r").exists()
+
+
+def test_stopping_early_is_a_break(kit: SimpleNamespace, tmp_path: Path):
+    from pgkit.run import Run
+
+    with Run(arguments(tmp_path / "r"), "walk") as log:
+        log.track(policy=kit.policy(), eval_env=kit.Env)
+        log.step(10, None, {"x": 1.0, "own/y": 2.0})
+    last = rows(tmp_path / "r")[-1]
+    assert last["frames"] == "10" and last["eval/mean_reward"] != ""
+    assert {"train/x", "own/y"} < last.keys()
+    assert json.loads((tmp_path / "r/summary.json").read_text())["frames"] == 10
+
+
+def test_the_default_directory_names_env_recipe_and_seed(
+    kit: SimpleNamespace, tmp_path: Path, monkeypatch: Any
+):
+    monkeypatch.chdir(tmp_path)
+    args = arguments(tmp_path)
+    args.run_dir = None
+    log = kit.train(args)
+    assert log.dir.parent == Path("runs") and log.dir.name.startswith("Fake-Count-v0__walk__1__20")
