@@ -1,9 +1,9 @@
 """``pgkit ls / cp / run / eval / plot``. Heavy imports wait until a command needs them."""
 
 import argparse
-import runpy
 import shutil
 import sys
+import types
 from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
@@ -107,7 +107,10 @@ def run_recipe(args: argparse.Namespace) -> None:
     path = recipes.find(args.recipe)
     sys.argv = [args.recipe, *args.flags]
     sys.path.insert(0, str(path.resolve().parent))
-    runpy.run_path(str(path), run_name="__main__")
+    script = types.ModuleType("__main__")  # as runpy.run_path does it, but argv[0] stays what the user typed
+    script.__file__ = str(path.resolve())
+    sys.modules["__main__"] = script
+    exec(compile(path.read_bytes(), script.__file__, "exec"), script.__dict__)
 
 
 def evaluate_run(args: argparse.Namespace) -> None:

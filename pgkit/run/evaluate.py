@@ -13,12 +13,15 @@ from pgkit.run.seeding import preserved_rng
 
 
 @contextmanager
-def _eval_mode(module: torch.nn.Module) -> Iterator[None]:
-    training = [(part, part.training) for part in module.modules()]
-    module.eval()
+def _evaluating(policy: torch.nn.Module) -> Iterator[None]:
+    """Evaluation mode, and one thread: for a few rows a second thread costs more than it brings."""
+    training, threads = [(part, part.training) for part in policy.modules()], torch.get_num_threads()
+    policy.eval()
+    torch.set_num_threads(1)
     try:
         yield
     finally:
+        torch.set_num_threads(threads)
         for part, mode in training:
             part.training = mode
 
@@ -43,7 +46,7 @@ def play(policy: torch.nn.Module, env: Any, episodes: int) -> tuple[np.ndarray, 
         env: has ``.arrays``: ``reset()``, ``step(action)``, ``obs``, ``episode_reward``, ``step_count``.
     """
     arrays = env.arrays
-    with preserved_rng(), _eval_mode(policy):
+    with preserved_rng(), _evaluating(policy):
         obs = arrays.reset()
         slots = len(obs)
         share = [episodes // slots + (slot < episodes % slots) for slot in range(slots)]

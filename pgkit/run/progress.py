@@ -1,6 +1,7 @@
 """What a run shows while it trains: a live bar on a terminal, a line an evaluation on a pipe."""
 
 import math
+from collections.abc import Mapping
 
 from rich.console import Console
 from rich.progress import (
@@ -34,6 +35,12 @@ class Live:
     def update(self, frames: int, score: float, fps: float) -> None:
         """Show the latest mean return and speed."""
         self._bar.update(self._task, completed=frames, score=_short(score, ".1f"), fps=_short(fps, ",.0f"))
+
+    def evaluated(self, frames: int, score: float, fps: float, scores: Mapping[str, float]) -> None:
+        """Print the line of an evaluation."""
+        result = f"{scores['eval/mean_reward']:.1f} ± {scores['eval/std_reward']:.1f}"
+        speed = f"{_short(fps, ',.0f')} frames/s"
+        self.line(f"frames {frames:>10,}   return {_short(score, '.1f')}   eval {result}   {speed}")
 
     def line(self, text: str) -> None:
         """Print a line: above the bar on a terminal, as it is on a pipe."""

@@ -20,7 +20,7 @@ from pgkit.run.metrics import Metrics, column, finished_episodes, read_csv, warm
 from pgkit.run.plots import plot
 from pgkit.run.policy import describe_env
 from pgkit.run.progress import Live
-from pgkit.run.settings import RunArgs, recipe_target
+from pgkit.run.settings import RunArgs, check, recipe_target
 
 NAN = float("nan")
 
@@ -37,6 +37,7 @@ class Run:
     """
 
     def __init__(self, args: RunArgs, recipe: str):
+        check(args)
         self.args, self.recipe = args, recipe
         self.dir = directory.choose(args, recipe)
         self._saved = self._load() if args.resume else None
@@ -150,10 +151,8 @@ class Run:
             self._evaluated = {"frames": self.frames, **scores}
             if scores["eval/mean_reward"] > self.best.get("eval/mean_reward", -float("inf")):
                 self.best = self._evaluated
-        reward, fps = row.get("rollout/ep_rew_mean", NAN), row.get("time/fps", NAN)
-        score = f"{scores['eval/mean_reward']:.1f} ± {scores['eval/std_reward']:.1f}"
-        self._live.line(
-            f"frames {self.frames:>10,}   return {reward:.1f}   eval {score}   {fps:,.0f} frames/s"
+        self._live.evaluated(
+            self.frames, row.get("rollout/ep_rew_mean", NAN), row.get("time/fps", NAN), scores
         )
         return scores
 

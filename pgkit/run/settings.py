@@ -92,6 +92,16 @@ def parse(args_class: type[A], presets: Presets, argv: Sequence[str]) -> A:
     return args
 
 
+def check(args: RunArgs) -> None:
+    """A UserError for a number that no run can have."""
+    for name in ("total_frames", "num_envs", "workers", "eval_episodes", "threads"):
+        if getattr(args, name) < 1:
+            raise UserError(f"--{name.replace('_', '-')} {getattr(args, name)}: give at least 1")
+    for name in ("eval_every", "seed"):
+        if getattr(args, name) < 0:
+            raise UserError(f"--{name.replace('_', '-')} {getattr(args, name)}: give at least 0")
+
+
 def main_doc(args_class: type[RunArgs]) -> str:
     """The first line of the recipe's module docstring."""
     module = sys.modules.get(args_class.__module__)

@@ -83,6 +83,7 @@ def inside(trained: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(trained)
     monkeypatch.setattr(sys, "argv", sys.argv)
     monkeypatch.setattr(sys, "path", [*sys.path])
+    monkeypatch.setitem(sys.modules, "__main__", sys.modules["__main__"])
     return trained
 
 
@@ -135,6 +136,7 @@ def test_flags_reach_the_recipe(inside: Path, capsys: pytest.CaptureFixture[str]
     ("words", "message"),
     [
         (["run", "walk.py", "--resume", "r", "--total-frames", "10"], "already trained"),
+        (["run", "walk.py", "--eval-episodes", "0"], "--eval-episodes 0: give at least 1"),
         (["run", "nothing.py"], "no recipe file nothing.py"),
         (["eval", "."], "not a run directory"),
         (["plot", "."], "not a run directory"),
@@ -172,6 +174,13 @@ def test_cp_copies_and_never_overwrites(shelf: Path, capsys: pytest.CaptureFixtu
     assert "not overwritten" in fail(capsys, "cp", "ppo", str(target))
     assert target.read_text() == "edited"
     assert "no directory" in fail(capsys, "cp", "ppo", str(shelf / "no/mine.py"))
+
+
+def test_a_shipped_recipe_is_run_under_the_name_that_was_typed(shelf: Path, inside: Path):
+    (shelf / "shelf/say.py").write_text("import sys\nraise SystemExit((__name__, *sys.argv))\n")
+    with pytest.raises(SystemExit) as exit_:
+        main(["run", "say", "--seed", "3"])
+    assert exit_.value.code == ("__main__", "say", "--seed", "3")
 
 
 def test_an_unknown_recipe_names_the_nearest(shelf: Path, capsys: pytest.CaptureFixture[str]):
