@@ -7,7 +7,6 @@ from typing import Any
 
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torchrl.collectors import Collector
 from torchrl.envs import Compose, EnvBase, RewardSum, StepCounter, TransformedEnv
 
 
@@ -34,10 +33,13 @@ class TorchRLCollector:
         total_frames: int = -1,
         **kwargs: Any,
     ) -> None:
+        from torchrl.collectors import Collector  # slow to import, and rarely needed
+
         env = TransformedEnv(env, Compose(RewardSum(), StepCounter()))
         self.frames = 0
+        kwargs = {"trust_policy": True, "auto_register_policy_transforms": True} | kwargs
         self.collector = Collector(
-            env, actor, frames_per_batch=frames_per_batch, total_frames=total_frames, trust_policy=True, **kwargs
+            env, actor, frames_per_batch=frames_per_batch, total_frames=total_frames, **kwargs
         )
 
     def __iter__(self) -> Iterator[TensorDictBase]:

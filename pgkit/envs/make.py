@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import warnings
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -44,10 +45,14 @@ def make_one(env_id: str, **kwargs: Any) -> gym.Env:
     if env_id.startswith("dmc:"):
         env_id = f"dm_control/{env_id.removeprefix('dmc:')}-v0"
     try:
+        if "mujoco" in _entry_point(env_id):
+            _hear_mujoco()
         if env_id.startswith("dm_control/"):
             return _make_dm_control(env_id, **kwargs)
         return gym.make(env_id, disable_env_checker=True, **kwargs)
-    except (gym.error.UnregisteredEnv, gym.error.NamespaceNotFound) as error:
+    except gym.error.UnregisteredEnv as error:
+        if env_id.startswith("ALE/") and not any(known.startswith("ALE/") for known in gym.registry):
+            raise UserError(f"environment '{env_id}' needs ale-py: pip install ale-py, then import ale_py") from error
         raise _unknown(env_id, list(gym.registry)) from error
     except (gym.error.DependencyNotInstalled, ImportError) as error:
         reason = str(error).splitlines()[0].rstrip(".")
@@ -57,10 +62,31 @@ def make_one(env_id: str, **kwargs: Any) -> gym.Env:
         ) from error
 
 
-def _make_dm_control(env_id: str, **kwargs: Any) -> gym.Env:
-    from dm_control import suite
-    from shimmy.dm_control_compatibility import DmControlCompatibilityV0
+def _entry_point(env_id: str) -> str:
+    if env_id.startswith("dm_control/"):
+        return "dm_control.mujoco"
+    spec = gym.registry.get(env_id)
+    return str(spec.entry_point) if spec else ""
 
+
+def _hear_mujoco() -> None:
+    """MuJoCo's warnings become Python's, deprecations in Gymnasium's model files left out; no MUJOCO_LOG.TXT."""
+    import mujoco
+
+    def hear(message: bytes | str) -> None:
+        text = message.decode() if isinstance(message, bytes) else message
+        if "deprecated" not in text:
+            warnings.warn(f"MuJoCo: {text}", RuntimeWarning, stacklevel=2)
+
+    mujoco.set_mju_user_warning(hear)
+
+
+def _make_dm_control(env_id: str, **kwargs: Any) -> gym.Env:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # glfw says at import that there is no display
+        from dm_control import suite
+        from shimmy.dm_control_compatibility import DmControlCompatibilityV0
+    _hear_mujoco()  # again: dm_control has put its own hearer in place
     domain, _, task = env_id.removeprefix("dm_control/").removesuffix("-v0").partition("-")
     tasks = [(d, t) for d, t in suite.ALL_TASKS]
     if (domain, task) not in tasks:
@@ -77,9 +103,8 @@ def _unknown(env_id: str, known: list[str]) -> UserError:
 def _extra(env_id: str) -> str:
     if env_id.startswith("dm_control/"):
         return "shimmy[dm-control]"
-    spec = gym.registry.get(env_id)
-    entry = str(spec.entry_point) if spec else ""
+    entry = _entry_point(env_id)
     for family in ("box2d", "mujoco", "toy_text", "classic_control"):
         if family in entry:
             return f"gymnasium[{family.replace('_', '-')}]"
-    return "ale-py" if env_id.startswith("ALE/") else "gymnasium[all]"
+    return "gymnasium[all]"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import time
 import types
+import warnings
 from collections.abc import Callable, Sequence
 from logging import getLogger
 from typing import Any
@@ -94,7 +95,8 @@ class GradientStep:
                 metrics, grads = self._compiled(data, index)
         else:
             start = time.perf_counter()
-            with torch._dynamo.config.patch(trace_autograd_ops=True):
+            with torch._dynamo.config.patch(trace_autograd_ops=True), warnings.catch_warnings():
+                warnings.simplefilter("ignore", FutureWarning)  # tensordict reads a retired dynamo setting
                 metrics, grads = self._compiled(data, index)
             self.compile_seconds += time.perf_counter() - start
             self._seen.add(signature)

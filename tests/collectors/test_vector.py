@@ -1,0 +1,155 @@
+import pytest
+import torch
+
+from pgkit import collectors, envs, modules
+from pgkit.collectors.policy import trace
+from pgkit.errors import UserError
+
+
+def make(env_id="Pendulum-v1", workers=1, num_envs=4, steps=50, **kwargs):
+    torch.manual_seed(0)
+    env = envs.make(env_id, num_envs=num_envs, seed=3, workers=workers)
+    build = modules.gaussian_actor if env.action_spec.dtype.is_floating_point else modules.categorical_actor
+    actor = build(env, normalizer=modules.ObsNormalizer(env))
+    return actor, collectors.VectorCollector(env, actor, frames_per_batch=num_envs * steps, **kwargs)
+
+
+def equal(a, b):
+    return set(a.keys(True, True)) == set(b.keys(True, True)) and bool((a == b).all())
+
+
+@pytest.mark.parametrize("env_id", ["Pendulum-v1", "CartPole-v1"])
+def test_rollout_has_torchrls_keys_and_shapes(env_id):
+    _, collector = make(env_id)
+    rollout = collector.rollout()
+    assert rollout.batch_size == (4, 50)
+    keys = {"observation", "action", "action_log_prob"}
+    nexts = ("observation", "reward", "terminated", "truncated", "done", "episode_reward", "step_count")
+    assert set(rollout.keys(True, True)) == keys | {("next", key) for key in nexts}
+    for key in nexts[1:]:
+        assert rollout["next", key].shape == (4, 50, 1)
+    assert rollout["action_log_prob"].shape == (4, 50)
+    going_on = ~rollout["next", "done"][:, :-1, 0]
+    assert torch.equal(rollout["next", "observation"][:, :-1][going_on], rollout["observation"][:, 1:][going_on])
+
+
+def test_reset_observation_is_never_the_next_observation():
+    _, collector = make("CartPole-v1", steps=200)
+    rollout = collector.rollout()
+    done = rollout["next", "done"][..., 0]
+    assert done.sum() > 10
+    assert (rollout["next", "observation"][done].abs().amax(-1) > 0.2).all()  # poles that fell
+    assert (rollout["observation"][:, 1:][done[:, :-1]].abs() <= 0.05).all()  # CartPole's starts
+
+
+def test_log_probability_is_that_of_the_stored_action():
+    actor, collector = make("HalfCheetah-v5", steps=20)
+    rollout = collector.rollout()
+    again = actor.get_dist(rollout.select("observation")).log_prob(rollout["action"])
+    torch.testing.assert_close(rollout["action_log_prob"], again, rtol=1e-4, atol=1e-5)
+    assert rollout["action"].abs().max() > 1  # as sampled, not as clipped
+
+
+def test_the_number_of_workers_does_not_change_the_numbers():
+    rollouts = []
+    for workers in (1, 2, 4):
+        actor, collector = make("HalfCheetah-v5", workers=workers, steps=20)
+        first = collector.rollout()
+        with torch.no_grad():
+            for p in actor.parameters():
+                p.mul_(1.1)
+        rollouts.append((first, collector.rollout()))
+        collector.shutdown()
+    for other in rollouts[1:]:
+        assert equal(rollouts[0][0], other[0]) and equal(rollouts[0][1], other[1])
+
+
+def test_new_weights_take_effect_and_the_global_generator_does_not():
+    actor, collector = make()
+    torch.manual_seed(123)
+    a, state = collector.rollout(), torch.get_rng_state()
+    torch.manual_seed(123)
+    assert torch.equal(state, torch.get_rng_state())
+    _, again = make()
+    assert equal(a, again.rollout())
+    with torch.no_grad():
+        actor.module[0].module[-1].log_std.fill_(-20.0)
+    quiet = collector.rollout()
+    mean = actor.get_dist(quiet.select("observation")).base_dist.loc
+    torch.testing.assert_close(quiet["action"], mean)
+    actor.module[0].module[-1].log_std = torch.nn.Parameter(torch.zeros(1))  # replaced, not changed in place
+    assert (collector.rollout()["action"] - mean).abs().max() > 0.5
+
+
+@pytest.mark.parametrize(("before", "after"), [(1, 1), (2, 1), (1, 2)])
+def test_resume_is_exact_for_any_number_of_workers(before, after):
+    _, collector = make("CartPole-v1", workers=before)
+    collector.rollout()
+    state = collector.state_dict()
+    expected = collector.rollout()
+    collector.shutdown()
+    _, other = make("CartPole-v1", workers=after)
+    other.load_state_dict(state)
+    assert equal(other.rollout(), expected) and other.frames == collector.frames == 400
+    other.shutdown()
+
+
+def test_traced_policy_is_the_actor_bit_for_bit():
+    actor, collector = make()
+    obs = torch.from_numpy(collector.env.arrays.reset())
+    act = trace(actor, obs)
+    torch.manual_seed(5)
+    traced = act(obs)
+    torch.manual_seed(5)
+    td = actor(collector.env.reset().set("observation", obs))
+    assert torch.equal(traced[0], td["action"]) and torch.equal(traced[1], td["action_log_prob"])
+
+
+def test_episode_totals():
+    _, collector = make("CartPole-v1", steps=100)
+    rollout = collector.rollout()
+    done = rollout["next", "done"]
+    ends = done[0, :, 0].nonzero().flatten()
+    lengths = torch.diff(ends, prepend=torch.tensor([-1]))
+    assert torch.equal(rollout["next", "step_count"][0][done[0]], lengths)
+    assert torch.equal(rollout["next", "episode_reward"][0][done[0]], lengths.float())  # a reward of 1 a step
+
+
+def test_frames_are_counted_and_bounded():
+    _, collector = make(total_frames=500)
+    assert [collector.frames for _ in collector] == [200, 400, 600]
+    with pytest.raises(UserError, match="total_frames=100 is less than one rollout"):
+        make(total_frames=100)
+    with pytest.raises(UserError, match="not a multiple of the 4 environments"):
+        env = envs.make("Pendulum-v1", num_envs=4)
+        collectors.VectorCollector(env, modules.gaussian_actor(env), frames_per_batch=50)
+
+
+def test_an_actor_of_another_env():
+    actor, _ = make("CartPole-v1")
+    with pytest.raises(UserError, match=r"cannot read observations of shape \(3,\).*built for another environment"):
+        collectors.VectorCollector(envs.make("Pendulum-v1"), actor, frames_per_batch=10)
+    reacher = modules.gaussian_actor(envs.make("Hopper-v5"))  # 11 observations, as InvertedDoublePendulum v4 had
+    with pytest.raises(UserError, match="built for another environment"):
+        collectors.VectorCollector(envs.make("HalfCheetah-v5"), reacher, frames_per_batch=10)
+
+
+def test_a_failing_worker_reports_its_traceback():
+    env = envs.make("Pendulum-v1", num_envs=2, workers=2)
+    collector = collectors.VectorCollector(env, modules.gaussian_actor(env), frames_per_batch=4)
+    env.make_env = lambda: 1 / 0
+    with pytest.raises(RuntimeError, match="collector worker 0 failed:(.|\n)*ZeroDivisionError"):
+        collector.rollout()
+
+
+def test_torchrl_collector_gives_the_same_seam():
+    env = envs.make("CartPole-v1", num_envs=2, seed=1)
+    actor = modules.categorical_actor(env)
+    collector = collectors.TorchRLCollector(env, actor, frames_per_batch=100, total_frames=200)
+    rollouts = list(collector)
+    assert collector.frames == 200 and rollouts[0].batch_size == (2, 50)
+    _, own = make("CartPole-v1")
+    assert set(own.rollout().keys(True, True)) <= set(rollouts[0].keys(True, True))
+    done = rollouts[0]["next", "done"]
+    lengths = rollouts[0]["next", "step_count"][done]
+    assert torch.equal(rollouts[0]["next", "episode_reward"][done], lengths.float())

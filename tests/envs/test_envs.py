@@ -1,0 +1,152 @@
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from torchrl.envs.utils import check_env_specs
+
+from pgkit import envs
+from pgkit.errors import UserError
+
+
+class Counter(gym.Env):
+    """Observation: steps since reset; terminates after 3 steps, or is truncated after 5 if ``endless``."""
+
+    observation_space = spaces.Box(-np.inf, np.inf, (1,))
+    action_space = spaces.Box(np.array([-1.0, 0.0], np.float32), np.array([1.0, 5.0], np.float32))
+
+    def __init__(self, endless=False):
+        self.endless = endless
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t, self.start = 0, self.np_random.random()
+        return np.array([self.start]), {}
+
+    def step(self, action):
+        self.t += 1
+        self.action = action
+        obs = np.array([self.start + self.t])
+        return obs, 2.0, not self.endless and self.t == 3, self.endless and self.t == 5, {}
+
+
+def test_same_step_autoreset_keeps_the_final_observation():
+    arrays = envs.make(Counter, num_envs=2, seed=3).arrays
+    first = arrays.reset().copy()
+    action = np.zeros((2, 2), np.float32)
+    for t in (1, 2, 3):
+        next_obs, reward, terminated, truncated = arrays.step(action)
+        np.testing.assert_allclose(next_obs, first + t, rtol=1e-6)
+        assert reward.tolist() == [2.0, 2.0] and not truncated.any()
+        assert terminated.all() == (t == 3)
+        assert arrays.episode_reward.tolist() == [2.0 * t] * 2 and arrays.step_count.tolist() == [t, t]
+    assert (arrays.obs != next_obs).all() and (arrays.obs < 1).all()  # the next episode's first
+    arrays.step(action)
+    assert arrays.episode_reward.tolist() == [2.0, 2.0] and arrays.step_count.tolist() == [1, 1]
+
+
+def test_truncation_is_not_termination():
+    arrays = envs.make(lambda: Counter(endless=True), num_envs=1).arrays
+    arrays.reset()
+    flags = [tuple(x[0] for x in arrays.step(np.zeros((1, 2), np.float32))[2:]) for _ in range(5)]
+    assert flags == [(False, False)] * 4 + [(False, True)]
+
+
+def test_actions_are_clipped_to_asymmetric_bounds():
+    arrays = envs.make(Counter, num_envs=1).arrays
+    arrays.reset()
+    arrays.step(np.array([[-9.0, -9.0]], np.float32))
+    assert arrays.envs[0].unwrapped.action.tolist() == [-1.0, 0.0]
+    arrays.step(np.array([[9.0, 9.0]], np.float32))
+    assert arrays.envs[0].unwrapped.action.tolist() == [1.0, 5.0]
+
+
+def test_every_env_has_its_own_stream_and_the_seed_decides():
+    def obs(seed):
+        return envs.make("Pendulum-v1", num_envs=3, seed=seed).arrays.reset().copy()
+
+    assert len(np.unique(obs(1)[:, 0])) == 3
+    assert np.array_equal(obs(1), obs(1)) and not np.array_equal(obs(1), obs(2))
+
+
+@pytest.mark.parametrize("env_id", ["CartPole-v1", "HalfCheetah-v5", "dm_control/cheetah-run-v0"])
+def test_state_replays_bit_for_bit(env_id):
+    def play(env, steps, rng):
+        out = [env.arrays.obs.copy()]
+        for _ in range(steps):
+            shape = env.action_spec.shape
+            action = rng.integers(2, size=shape) if env_id == "CartPole-v1" else rng.uniform(-1, 1, shape)
+            out += [x.copy() for x in env.arrays.step(action.astype(np.float32) if len(shape) > 1 else action)]
+            out += [env.arrays.obs.copy(), env.arrays.episode_reward.copy()]
+        return out
+
+    env = envs.make(env_id, num_envs=2, seed=7)
+    env.arrays.reset()
+    play(env, 30, np.random.default_rng(0))
+    again = envs.make(env_id, num_envs=2, seed=7)
+    again.arrays.load_state_dict(env.arrays.state_dict())
+    a, b = (play(e, 40, np.random.default_rng(1)) for e in (env, again))
+    assert all(np.array_equal(x, y) for x, y in zip(a, b, strict=True))
+
+
+@pytest.mark.parametrize("env_id", ["CartPole-v1", "Pendulum-v1", "dmc:cartpole-swingup"])
+def test_torchrl_accepts_the_env(env_id):
+    check_env_specs(envs.make(env_id, num_envs=3))
+
+
+def test_dm_control_time_limit_truncates():
+    env = envs.make("dm_control/cartpole-swingup-v0", num_envs=1)
+    env.arrays.reset()
+    for _ in range(1000):
+        _, _, terminated, truncated = env.arrays.step(np.zeros((1, 1), np.float32))
+    assert truncated.all() and not terminated.any()
+
+
+def test_dict_observations_are_flattened_in_the_order_of_the_space():
+    class Two(Counter):
+        observation_space = spaces.Dict({"a": spaces.Box(-9, 9, (2,)), "b": spaces.Box(-9, 9, ())})
+
+        def reset(self, *, seed=None, options=None):
+            super().reset(seed=seed)
+            return {"b": np.float64(3.0), "a": np.array([1.0, 2.0])}, {}
+
+    env = envs.make(Two)
+    assert env.observation_spec_unbatched["observation"].shape == (3,)
+    obs = env.arrays.reset()
+    assert obs.tolist() == [[1.0, 2.0, 3.0]] and obs.dtype == np.float32
+
+
+def test_a_discrete_space_may_start_elsewhere():
+    class Shifted(Counter):
+        action_space = spaces.Discrete(2, start=5)
+
+    arrays = envs.make(Shifted).arrays
+    arrays.reset()
+    arrays.step(np.array([1]))
+    assert arrays.envs[0].unwrapped.action == 6
+
+
+@pytest.mark.parametrize(
+    ("env_id", "message"),
+    [
+        ("HalfCheeta-v5", "unknown environment id 'HalfCheeta-v5'; the nearest names are HalfCheetah-v5"),
+        ("dm_control/cheetah-fly-v0", "nearest names are dm_control/cheetah-run-v0"),
+        ("HalfCheetah-v99", "unknown environment id"),
+    ],
+)
+def test_unknown_ids(env_id, message):
+    with pytest.raises(UserError, match=message):
+        envs.make(env_id)
+
+
+def test_missing_package_names_the_install_line(monkeypatch):
+    def missing(*args, **kwargs):
+        raise gym.error.DependencyNotInstalled("Box2D is not installed")
+
+    monkeypatch.setattr(gym, "make", missing)
+    with pytest.raises(UserError, match=r'pip install "gymnasium\[box2d\]"'):
+        envs.make("LunarLander-v3")
+
+
+def test_more_workers_than_envs():
+    with pytest.raises(UserError, match="every worker needs at least one environment"):
+        envs.make("CartPole-v1", num_envs=2, workers=3)

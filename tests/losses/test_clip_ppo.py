@@ -1,0 +1,131 @@
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.objectives import ClipPPOLoss as TorchRLClipPPOLoss
+from torchrl.objectives.utils import ValueEstimators
+
+from pgkit import envs, losses, modules
+
+
+def make_batch(actor, env, rows=32):
+    torch.manual_seed(1)
+    batch = TensorDict({"observation": torch.randn(rows, *env.observation_spec_unbatched["observation"].shape)}, [rows])
+    batch = actor(batch).detach()
+    batch["action_log_prob"] += 0.3 * torch.randn(rows)
+    batch["advantage"], batch["value_target"] = torch.randn(rows, 1) + 0.5, torch.randn(rows, 1)
+    batch["state_value"] = torch.randn(rows, 1)
+    return batch
+
+
+@pytest.fixture(params=["Pendulum-v1", "CartPole-v1"])
+def agent(request):
+    torch.manual_seed(0)
+    env = envs.make(request.param)
+    build = modules.gaussian_actor if request.param == "Pendulum-v1" else modules.categorical_actor
+    actor, critic = build(env), modules.state_value(env)
+    return env, actor, critic
+
+
+@pytest.mark.parametrize(
+    "kwargs",
+    [
+        {"clip_epsilon": 0.1, "entropy_coeff": 0.01},
+        {"clip_epsilon": (0.1, 0.3), "normalize_advantage": True},
+        {"clip_value": 0.2, "critic_coeff": 0.5, "loss_critic_type": "l2"},
+        {"clip_value": True, "loss_critic_type": "smooth_l1", "reduction": "sum"},
+        {"entropy_bonus": False},
+    ],
+)
+def test_agrees_with_torchrl(agent, kwargs):
+    env, actor, critic = agent
+    batch = make_batch(actor, env)
+    settings = {"normalize_advantage": False, "entropy_coeff": 0.0, "loss_critic_type": "l2"} | kwargs
+    mine, theirs = losses.ClipPPOLoss(actor, critic, **settings), TorchRLClipPPOLoss(actor, critic, **settings)
+    a, b = mine(batch), theirs(batch.copy())
+    shared = [key for key in a.keys() if key in b.keys()]
+    assert {"loss_objective", "loss_critic", "clip_fraction", "explained_variance"} <= set(shared)
+    for key in shared:
+        torch.testing.assert_close(a[key].squeeze(), b[key].squeeze(), rtol=1e-4, atol=1e-5, msg=key)
+    parameters = [*actor.parameters(), *critic.parameters()]
+    totals = [sum(v.sum() for k, v in out.items() if k.startswith("loss_")) for out in (a, b)]
+    gradients = [torch.autograd.grad(total, parameters) for total in totals]
+    for g, h in zip(*gradients, strict=True):
+        torch.testing.assert_close(g, h, rtol=1e-3, atol=1e-5)
+
+
+def test_by_hand(agent):
+    # all ratios are 1: objective = mean advantage (not normalized), no clipping, no divergence
+    env, actor, critic = agent
+    batch = make_batch(actor, env)
+    batch["action_log_prob"] = actor.get_dist(batch.copy()).log_prob(batch["action"]).detach()
+    out = losses.ClipPPOLoss(actor, critic, normalize_advantage=False, critic_coeff=0.5)(batch)
+    assert out["loss_objective"].item() == pytest.approx(-batch["advantage"].mean().item(), abs=1e-6)
+    value = critic(batch.copy())["state_value"]
+    expected = 0.5 * (value - batch["value_target"]).square().mean()
+    assert out["loss_critic"].item() == pytest.approx(expected.item(), rel=1e-5)
+    assert out["approx_kl"].item() == pytest.approx(0, abs=1e-6) and out["clip_fraction"].item() == 0
+
+
+def test_surrogate_is_maximized_and_gets_the_normalized_advantage(agent):
+    env, actor, critic = agent
+    batch, seen = make_batch(actor, env), {}
+
+    def surrogate(log_ratio, advantage):
+        seen.update(log_ratio=log_ratio, advantage=advantage)
+        return log_ratio.exp() * advantage
+
+    out = losses.ClipPPOLoss(actor, critic, surrogate=surrogate)(batch)
+    assert seen["advantage"].mean().item() == pytest.approx(0, abs=1e-6)
+    assert seen["advantage"].std().item() == pytest.approx(1, abs=1e-5)
+    expected = -(seen["log_ratio"].exp() * seen["advantage"]).mean()
+    assert out["loss_objective"].item() == pytest.approx(expected.item(), rel=1e-5)
+    with pytest.raises(ValueError, match="surrogate has shape"):
+        losses.ClipPPOLoss(actor, critic, surrogate=lambda r, a: (r * a).mean())(batch)
+
+
+def test_the_batch_is_left_as_it_was(agent):
+    env, actor, critic = agent
+    batch = make_batch(actor, env)
+    before = batch.clone()
+    losses.ClipPPOLoss(actor, critic)(batch)
+    assert set(batch.keys()) == set(before.keys()) and (batch == before).all()
+
+
+def test_missing_advantage_and_wrong_shapes(agent):
+    env, actor, critic = agent
+    loss, batch = losses.ClipPPOLoss(actor, critic), make_batch(actor, env)
+    with pytest.raises(KeyError, match="the batch has no 'advantage'.*advantages.GAE"):
+        loss(batch.exclude("advantage"))
+    with pytest.raises(ValueError, match=r"advantage has shape \(32,\) but log_ratio has shape \(32, 1\)"):
+        loss(batch.copy().set("advantage", batch["advantage"].squeeze(-1)))
+    with pytest.raises(ValueError, match=r"old_log_prob has shape \(32, 1\) but log_prob has shape \(32,\)"):
+        loss(batch.copy().set("action_log_prob", batch["action_log_prob"].unsqueeze(-1)))
+    with pytest.raises(ValueError, match=r"target has shape \(32,\)"):
+        loss(batch.copy().set("value_target", batch["value_target"].squeeze(-1)))
+
+
+def test_torchrl_plumbing(agent):
+    env, actor, critic = agent
+    loss, batch = losses.ClipPPOLoss(actor, critic, normalize_advantage=False), make_batch(actor, env)
+    assert loss.make_value_estimator(ValueEstimators.GAE, gamma=0.9, lmbda=0.8) is loss
+    expected = loss(batch)["loss_objective"]
+    loss.set_keys(advantage="my_advantage")
+    renamed = batch.rename_key_("advantage", "my_advantage")
+    torch.testing.assert_close(loss(renamed)["loss_objective"], expected)
+    loss.set_keys(advantage="advantage")
+    renamed.rename_key_("my_advantage", "advantage")
+    values = loss(**{key: batch[key] for key in loss.in_keys})  # @dispatch: tensors in, tuple out
+    torch.testing.assert_close(values[loss.out_keys.index("loss_objective")], expected)
+    loss.entropy_coeff = 0.5
+    assert loss.entropy_coeff.item() == 0.5 and isinstance(loss.entropy_coeff, torch.Tensor)
+
+
+def test_an_estimator_made_by_the_user_fills_in_the_advantage(agent):
+    env, actor, critic = agent
+    loss = losses.ClipPPOLoss(actor, critic).make_value_estimator(ValueEstimators.GAE, gamma=0.9, lmbda=0.8)
+    batch = make_batch(actor, env, rows=8).select("observation", "action", "action_log_prob").unsqueeze(0)
+    batch["next", "observation"] = batch["observation"] + 0.1
+    batch["next", "reward"] = torch.ones(1, 8, 1)
+    for key in ("done", "terminated"):
+        batch["next", key] = torch.zeros(1, 8, 1, dtype=torch.bool)
+    assert loss(batch)["loss_objective"].isfinite()

@@ -1,0 +1,68 @@
+import pytest
+import torch
+from torch import nn
+from torchrl.envs import GymEnv
+
+from pgkit import envs, losses, modules
+from pgkit.errors import UserError
+
+
+def test_orthogonal_gains():
+    torch.manual_seed(0)
+    net = modules.mlp(10, 3, (32,), out_gain=0.01)
+    first, last = net[0].weight, net[2].weight
+    torch.testing.assert_close(first.T @ first, 2 * torch.eye(10), atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(last @ last.T, 1e-4 * torch.eye(3), atol=1e-7, rtol=1e-3)
+    assert first.count_nonzero() > 0 and net[0].bias.count_nonzero() == 0
+
+
+@pytest.mark.parametrize("make", [lambda: envs.make("Pendulum-v1", num_envs=4), lambda: GymEnv("Pendulum-v1")])
+def test_builders_take_any_torchrl_env(make):
+    env = make()
+    out = modules.gaussian_actor(env, log_std=-0.5)(env.reset())
+    assert out["action"].shape == (*env.batch_size, 1)
+    assert out["action_log_prob"].shape == env.batch_size
+    torch.testing.assert_close(out["scale"], torch.full_like(out["scale"], 0.6065306))
+    assert modules.state_value(env)(env.reset())["state_value"].shape == (*env.batch_size, 1)
+    squashed = modules.tanh_normal_actor(env)(env.reset())["action"]
+    assert squashed.abs().max() <= 2.0
+
+
+def test_discrete_as_index_and_as_one_hot():
+    env = envs.make("CartPole-v1", num_envs=4)
+    assert modules.categorical_actor(env)(env.reset())["action"].shape == (4,)
+    theirs = GymEnv("CartPole-v1")
+    assert modules.categorical_actor(theirs)(theirs.reset())["action"].shape == (2,)
+
+
+def test_wrong_builder_names_the_right_one():
+    with pytest.raises(UserError, match="use modules.categorical_actor"):
+        modules.gaussian_actor(envs.make("CartPole-v1"))
+    with pytest.raises(UserError, match=r"use modules.gaussian_actor"):
+        modules.categorical_actor(envs.make("Pendulum-v1"))
+
+
+def test_who_trains_a_shared_encoder():
+    torch.manual_seed(0)
+    env = envs.make("Pendulum-v1", num_envs=4)
+    encoder = modules.mlp(3, None, (16,))
+    actor = modules.gaussian_actor(env, encoder=encoder)
+    critic = modules.state_value(env, encoder=encoder)
+    batch = actor(env.reset()).detach()
+    batch["advantage"], batch["value_target"] = torch.randn(4, 1), torch.randn(4, 1)
+
+    def encoder_gradients(separate):
+        loss = losses.ClipPPOLoss(actor, critic, separate_losses=separate)
+        out = loss(batch)
+        weight = encoder[0].weight
+        return [torch.autograd.grad(out[key], weight, allow_unused=True, retain_graph=True)[0] is not None
+                for key in ("loss_objective", "loss_critic")]  # fmt: skip
+
+    assert encoder_gradients(separate=False) == [True, True]
+    assert encoder_gradients(separate=True) == [True, False]
+
+
+def test_encoder_for_other_shapes():
+    env = envs.make("Pendulum-v1", num_envs=2)
+    encoder = nn.Sequential(nn.Linear(3, 5), nn.ReLU())
+    assert modules.state_value(env, encoder=encoder)(env.reset())["state_value"].shape == (2, 1)
