@@ -79,7 +79,7 @@ def matmuls() -> list[tuple[torch.Tensor, torch.Tensor, torch.Tensor]]:
 
     Target: actor and two critics forward. Critic loss: two critics forward; weight gradients of every layer,
     input gradients of all but the first. Actor loss: actor and two critics forward; input gradients through
-    both critics down to the action; the actor's weight gradients, and input gradients of all but its first layer.
+    both critics down to the action; the actor's weight gradients, input gradients of all but its first layer.
     """
     actor = [OBSERVATION, WIDTH, WIDTH, 2 * ACTION]
     critic = [OBSERVATION + ACTION, WIDTH, WIDTH, 1]

@@ -8,7 +8,7 @@ rollout, one optimizer, indices drawn once per epoch. `compiled` wraps `update` 
 import warnings
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDictBase
@@ -37,8 +37,8 @@ Update = Callable[[TensorDictBase], TensorDictBase]
 
 def make_env(env_id: str, num_envs: int) -> EnvBase:
     """`num_envs` copies of a Gymnasium env stepped in this process, with TorchRL's episode bookkeeping."""
-    gym_env: Any = GymEnv  # its signature comes from a metaclass
-    env = gym_env(env_id) if num_envs == 1 else SerialEnv(num_envs, lambda: gym_env(env_id))
+    serial_env = cast(Any, SerialEnv)  # its metaclass hides its signature
+    env = GymEnv(env_id) if num_envs == 1 else serial_env(num_envs, lambda: GymEnv(env_id))
     return TransformedEnv(env, Compose(RewardSum(), StepCounter(), DoubleToFloat()))
 
 
