@@ -1,4 +1,4 @@
-"""griffe extension: docstrings have reStructuredText equations and references, mkdocstrings reads Markdown."""
+"""griffe extension: docstrings write equations as reStructuredText, mkdocstrings reads Markdown."""
 
 import inspect
 import re

@@ -8,7 +8,7 @@ rollout, one optimizer, indices drawn once per epoch. `compiled` wraps `update` 
 import warnings
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import Any, cast
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -17,7 +17,6 @@ from torch import nn
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import (
-    Compose,
     DoubleToFloat,
     EnvBase,
     GymEnv,
@@ -37,9 +36,11 @@ Update = Callable[[TensorDictBase], TensorDictBase]
 
 def make_env(env_id: str, num_envs: int) -> EnvBase:
     """`num_envs` copies of a Gymnasium env stepped in this process, with TorchRL's episode bookkeeping."""
-    serial_env = cast(Any, SerialEnv)  # its metaclass hides its signature
-    env = GymEnv(env_id) if num_envs == 1 else serial_env(num_envs, lambda: GymEnv(env_id))
-    return TransformedEnv(env, Compose(RewardSum(), StepCounter(), DoubleToFloat()))
+    env = GymEnv(env_id) if num_envs == 1 else SerialEnv(num_envs, lambda: GymEnv(env_id))
+    env = TransformedEnv(env)
+    for transform in (RewardSum(), StepCounter(), DoubleToFloat()):
+        env.append_transform(transform)
+    return env
 
 
 def ppo_nets(env: EnvBase, hidden: tuple[int, ...] = (64, 64)) -> tuple[ProbabilisticActor, ValueOperator]:
