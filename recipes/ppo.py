@@ -67,7 +67,7 @@ class Args(run.RunArgs):
 PRESETS = {
     "CartPole-*": dict(
         total_frames=100_000, eval_every=25_000, steps=32, epochs=20, minibatch_size=256, learning_rate=1e-3,
-        anneal=True, gamma=0.98, lmbda=0.8, normalize_advantage="minibatch", recompute_advantage=False,
+        gamma=0.98, lmbda=0.8, normalize_advantage="minibatch", recompute_advantage=False,
         normalize_obs=False, scale_returns=False, critic_coeff=0.5,
     ),
     "Pendulum-*": dict(

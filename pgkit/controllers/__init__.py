@@ -1,5 +1,6 @@
 """What sets a loss's coefficient while it trains."""
 
 from pgkit.controllers.schedules import Schedule, constant, linear
+from pgkit.controllers.temperature import FixedTemperature, Temperature
 
-__all__ = ["Schedule", "constant", "linear"]
+__all__ = ["FixedTemperature", "Schedule", "Temperature", "constant", "linear"]

@@ -53,7 +53,7 @@ def functional(optimizer: Optimizer, fused: bool) -> tuple[Apply, Callable[[], N
 
     def read_learning_rates() -> None:
         for group, rate in zip(groups, rates, strict=True):
-            rate.copy_(torch.as_tensor(group["lr"]))
+            rate.fill_(group["lr"])
 
     return apply, read_learning_rates
 
@@ -64,7 +64,7 @@ def _state(optimizer: Optimizer, group: dict[str, Any], *names: str) -> list[lis
         state = optimizer.state[p]
         for name in names:
             if state.get(name) is None:
-                step = torch.zeros((), dtype=torch.float32, device=p.device)
+                step = torch.zeros((), dtype=torch.promote_types(p.dtype, torch.float32), device=p.device)
                 state[name] = step if name == "step" else torch.zeros_like(p, memory_format=torch.preserve_format)
     return [[optimizer.state[p][name] for p in group["params"]] for name in names]
 

@@ -1,0 +1,204 @@
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.objectives import ClipPPOLoss as TorchRLClipPPOLoss
+from torchrl.objectives.value import GAE as TorchRLGAE
+
+from pgkit import advantages, controllers, envs, losses, modules, updates
+from pgkit.errors import UserError
+
+
+def make_agent(seed=0, dtype=torch.float32, loss_class=losses.ClipPPOLoss, optimizer=torch.optim.Adam, **kwargs):
+    torch.manual_seed(seed)
+    env = envs.make("Pendulum-v1")
+    actor, critic = modules.gaussian_actor(env).to(dtype), modules.state_value(env).to(dtype)
+    loss = loss_class(actor, critic, entropy_coeff=0.01).to(dtype)
+    settings = {"epochs": 2, "minibatch_size": 32, "compile": "off", "seed": 1} | kwargs
+    parameters = optimizer([*actor.parameters(), *critic.parameters()], lr=1e-3)
+    gae = settings.pop("advantage", advantages.GAE(critic).to(dtype))
+    return updates.OnPolicyUpdate(loss, gae, parameters, **settings)
+
+
+def make_rollout(seed=0, dtype=torch.float32, rows=(2, 64)):
+    g = torch.Generator().manual_seed(seed)
+
+    def draw(*size):
+        return torch.randn(*rows, *size, generator=g, dtype=dtype)
+
+    done = draw(1) > 2
+    next_td = {"observation": draw(3), "reward": draw(1), "done": done, "terminated": done}
+    data = {"observation": draw(3), "action": draw(1), "action_log_prob": draw() * 0.1 - 1, "next": next_td}
+    return TensorDict(data, rows)
+
+
+def parameters(update):
+    return torch.cat([p.detach().flatten() for p in update.loss.parameters()])
+
+
+@pytest.mark.parametrize("loss_class", [losses.ClipPPOLoss, TorchRLClipPPOLoss])
+def test_eager_and_compiled_agree(loss_class):
+    eager, compiled = (
+        make_agent(dtype=torch.float64, loss_class=loss_class, compile=mode) for mode in ("off", "on")
+    )
+    for i in range(20):
+        a, b = (update(make_rollout(i, torch.float64)) for update in (eager, compiled))
+        assert a.keys() == b.keys()
+        assert a == pytest.approx(b, rel=1e-5, abs=1e-7)
+    torch.testing.assert_close(parameters(eager), parameters(compiled), rtol=0, atol=1e-5)
+    assert compiled.compile_seconds > 0 == eager.compile_seconds
+
+
+def test_two_compiled_agents_in_one_process_do_not_mix():
+    pair = [make_agent(seed, torch.float64, compile="on") for seed in (0, 1)]
+    alone = make_agent(1, torch.float64, compile="off")
+    start = [parameters(update).clone() for update in pair]
+    for i in range(3):
+        for update in pair:
+            update(make_rollout(i, torch.float64))
+        alone(make_rollout(i, torch.float64))
+    torch.testing.assert_close(parameters(pair[1]), parameters(alone), rtol=0, atol=1e-6)
+    assert not torch.equal(parameters(pair[0]) - start[0], parameters(pair[1]) - start[1])
+
+
+@pytest.mark.parametrize(
+    "optimizer",
+    [
+        torch.optim.Adam,
+        lambda p, lr: torch.optim.AdamW(p, lr=lr, weight_decay=0.1, amsgrad=True),
+        lambda p, lr: torch.optim.SGD(p, lr=lr, momentum=0.9, nesterov=True),
+        lambda p, lr: torch.optim.RMSprop(p, lr=lr, momentum=0.5, centered=True),
+        torch.optim.Adagrad,  # has no functional form here: steps outside the graph
+        lambda p, lr: torch.optim.Adam([{"params": p[:3], "lr": 1e-2}, {"params": p[3:]}], lr=lr),
+    ],
+)
+def test_optimizer_steps_as_torch_would(optimizer):
+    update = make_agent(optimizer=optimizer, dtype=torch.float64, epochs=1, minibatch_size=None, max_grad_norm=0.5)
+    twin = make_agent(optimizer=optimizer, dtype=torch.float64)
+    for i in range(3):
+        rollout = make_rollout(i, torch.float64)
+        update(rollout)
+        batch = twin.advantage(make_rollout(i, torch.float64)).reshape(-1)
+        order = torch.randperm(128, generator=twin._generator)
+        out = twin.loss(batch[order])
+        twin.optimizer.zero_grad()
+        (out["loss_objective"] + out["loss_critic"] + out["loss_entropy"]).backward()
+        torch.nn.utils.clip_grad_norm_(twin.loss.parameters(), 0.5)
+        twin.optimizer.step()
+    torch.testing.assert_close(parameters(update), parameters(twin), rtol=1e-9, atol=1e-9)
+    mine, theirs = update.optimizer.state_dict()["state"], twin.optimizer.state_dict()["state"]
+    for i in theirs:
+        for key, value in theirs[i].items():
+            torch.testing.assert_close(torch.as_tensor(mine[i][key]).double(), torch.as_tensor(value).double())
+
+
+def test_a_shorter_last_minibatch_counts_like_any_other():
+    update = make_agent(minibatch_size=48, epochs=1)  # 128 rows: 48 + 48 + 32
+    sizes, loss = [], update.loss.forward
+    update.loss.forward = lambda batch: (sizes.append(len(batch)), loss(batch))[1]
+    update(make_rollout())
+    assert sizes == [48, 48, 48, 32]  # the first is the assembly check
+
+
+def test_every_row_is_seen_once_an_epoch_and_in_another_order():
+    update, seen = make_agent(epochs=2), []
+    loss = update.loss.forward
+    update.loss.forward = lambda batch: (seen.append(batch["observation"]), loss(batch))[1]
+    rollout = make_rollout()
+    update(rollout)
+    epochs = torch.cat(seen[1:]).reshape(2, 128, 3)
+    expected = rollout["observation"].reshape(-1, 3).sort(0)[0]
+    assert torch.equal(epochs[0].sort(0)[0], expected) and torch.equal(epochs[1].sort(0)[0], expected)
+    assert not torch.equal(epochs[0], epochs[1])
+
+
+def test_target_kl_stops_after_the_epoch():
+    assert make_agent(epochs=8)(make_rollout())["epochs"] == 8
+    metrics = make_agent(epochs=8, target_kl=1e-4)(make_rollout())
+    assert metrics["epochs"] < 8 and metrics["approx_kl"] > 1e-4
+
+
+def test_schedules_reach_optimizer_and_loss():
+    schedules = {"lr": controllers.linear(1.0, 0.0), "entropy_coeff": controllers.linear(0.2, 0.1)}
+    update = make_agent(schedules=schedules, total_frames=256)
+    update(make_rollout())
+    assert update.optimizer.param_groups[0]["lr"] == 1.0
+    before = parameters(update).clone()
+    metrics = update(make_rollout())
+    assert metrics["learning_rate"] == 0.5 and update.loss.entropy_coeff.item() == pytest.approx(0.15)
+    assert (parameters(update) - before).abs().max() > 0.1
+    with pytest.raises(UserError, match="give total_frames too"):
+        make_agent(schedules=schedules)
+
+
+def test_recompute_advantage_uses_the_new_critic():
+    update, calls = make_agent(epochs=3, recompute_advantage=True), []
+    gae = update.advantage.forward
+    update.advantage.forward = lambda rollout: (calls.append(gae(rollout)["advantage"].clone()), rollout)[1]
+    update(make_rollout())
+    assert len(calls) == 3 and not torch.equal(calls[0], calls[1])
+
+
+def test_resume_is_exact():
+    update = make_agent()
+    update(make_rollout(0))
+    state = torch.utils._pytree.tree_map(lambda x: x.clone() if torch.is_tensor(x) else x, update.state_dict())
+    expected = update(make_rollout(1))
+    again = make_agent(seed=9, optimizer=torch.optim.Adam)
+    again.load_state_dict(state)
+    assert again(make_rollout(1)) == expected
+    assert torch.equal(parameters(again), parameters(update))
+
+
+def test_torchrl_parts_unmodified():
+    torch.manual_seed(0)
+    env = envs.make("Pendulum-v1")
+    actor, critic = modules.gaussian_actor(env), modules.state_value(env)
+    update = updates.OnPolicyUpdate(
+        loss=TorchRLClipPPOLoss(actor, critic),
+        advantage=TorchRLGAE(gamma=0.99, lmbda=0.95, value_network=critic),
+        optimizer=torch.optim.Adam([*actor.parameters(), *critic.parameters()]),
+        normalize_advantage=True,
+        compile="off",
+    )
+    assert update(make_rollout())["loss_critic"] > 0
+
+
+def test_advantage_is_normalized_by_one_owner_only():
+    with pytest.raises(UserError, match="normalizes the advantage already"):
+        make_agent(normalize_advantage=True)
+
+
+class TestWiring:
+    def test_missing_advantage(self):
+        with pytest.raises(UserError, match="has no 'advantage'.*written by nothing"):
+            make_agent(advantage=None)(make_rollout())
+
+    def test_wrong_shape(self):
+        rollout = make_rollout()
+        rollout["action_log_prob"] = rollout["action_log_prob"].unsqueeze(-1)
+        with pytest.raises(UserError, match=r"old_log_prob has shape \(32, 1\) but log_prob has shape \(32,\)"):
+            make_agent()(rollout)
+
+    def test_parameter_without_optimizer(self):
+        update = make_agent()
+        update.optimizer = torch.optim.Adam(list(update.loss.parameters())[:-1])
+        with pytest.raises(UserError, match="is in no group of the optimizer"):
+            update(make_rollout())
+
+    def test_optimizer_of_another_agent(self):
+        update = make_agent()
+        update.optimizer.add_param_group({"params": [torch.nn.Parameter(torch.zeros(7))]})
+        with pytest.raises(UserError, match=r"parameter 'of shape \(7,\)'.*no loss_\* entry"):
+            update(make_rollout())
+
+    def test_two_owners_of_gamma(self):
+        update = make_agent()
+        update.loss.make_value_estimator(gamma=0.9)
+        with pytest.raises(UserError, match="two owners of gamma: GAE has 0.99, .* has 0.9"):
+            update(make_rollout())
+
+    def test_no_loss_entry(self):
+        update = make_agent()
+        update.loss.forward = lambda batch: TensorDict({"objective": batch["advantage"].mean()})
+        with pytest.raises(UserError, match="no entry that begins with 'loss_'"):
+            update(make_rollout())
