@@ -1,0 +1,153 @@
+"""TorchRL's plumbing of the losses of an actor and action values on replayed data, written once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.modules.distributions.utils import rsample_and_log_prob
+from torchrl.objectives import LossModule
+from torchrl.objectives.utils import ValueEstimators, _vmap_func
+
+from pgkit.functional import bootstrap_target
+
+
+class QLoss(LossModule):
+    """Base of the losses of an actor and an ensemble of action values, with delayed target networks.
+
+    It holds the networks as TorchRL does (``qvalue_network_params``, ``target_qvalue_network_params``, ...), owns the
+    discount, names the keys, and gives subclasses four verbs: :meth:`act`, :meth:`q`, :meth:`target`,
+    :meth:`write_priority`.
+
+    Args:
+        actor_network: probabilistic actor.
+        qvalue_network: an ensemble, ``state_action_value [*B, critics]`` with an attribute ``num_critics``
+            (:func:`pgkit.modules.q_value`); or a list of modules with ``[*B, 1]``; or one such module, which is
+            copied ``num_qvalue_nets`` times with weights drawn again, as in TorchRL.
+        num_qvalue_nets: how many critics; an ensemble or a list brings its own number.
+        gamma: discount. This loss is its only owner.
+        delay_actor: use a delayed actor in the target.
+        delay_qvalue: use delayed critics in the target.
+        separate_losses: parameters that both networks share are trained by the policy's loss only.
+        reduction: ``mean``, ``sum`` or ``none``.
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Keys that :meth:`set_keys` can change, with TorchRL's names and defaults."""
+
+        action: NestedKey = "action"
+        log_prob: NestedKey = "action_log_prob"
+        state_action_value: NestedKey = "state_action_value"
+        reward: NestedKey = "reward"
+        done: NestedKey = "done"
+        terminated: NestedKey = "terminated"
+        priority: NestedKey = "td_error"
+        priority_weight: NestedKey = "priority_weight"
+        steps_to_next_obs: NestedKey = "steps_to_next_obs"
+
+    default_keys = _AcceptedKeys
+    default_value_estimator = ValueEstimators.TD0
+    out_keys: Sequence[NestedKey]
+    gamma: Tensor
+    actor_network: TensorDictModule
+    actor_network_params: Any
+    target_actor_network_params: Any
+    qvalue_network: TensorDictModule
+    qvalue_network_params: Any
+    target_qvalue_network_params: Any
+
+    def __init__(
+        self,
+        actor_network: TensorDictModule,
+        qvalue_network: TensorDictModule | Sequence[TensorDictModule],
+        *,
+        num_qvalue_nets: int = 2,
+        gamma: float = 0.99,
+        delay_actor: bool = False,
+        delay_qvalue: bool = True,
+        separate_losses: bool = False,
+        reduction: str | None = None,
+    ) -> None:
+        self._in_keys = self._out_keys = None
+        super().__init__()
+        self.reduction = "mean" if reduction is None else reduction
+        self.register_coeff_buffer("gamma", gamma)
+        self.convert_to_functional(actor_network, "actor_network", create_target_params=delay_actor)
+        several = isinstance(qvalue_network, Sequence) and not isinstance(qvalue_network, torch.nn.Module)
+        ensemble = not several and hasattr(qvalue_network, "num_critics")
+        self.convert_to_functional(
+            list(qvalue_network) if several else qvalue_network,
+            "qvalue_network",
+            None if ensemble else len(qvalue_network) if several else num_qvalue_nets,
+            create_target_params=delay_qvalue,
+            compare_against=list(actor_network.parameters()) if separate_losses else None,
+        )
+        self._each = None if ensemble else _vmap_func(self.qvalue_network, (None, 0), randomness=self.vmap_randomness)
+        self.set_keys(action=actor_network.dist_sample_keys[0], log_prob=actor_network.log_prob_keys[0])
+
+    def act(self, batch: TensorDictBase, params: Any) -> tuple[Tensor, Tensor]:
+        """An action drawn from the policy at the batch's observations, and its log-probability ``[*B]``: one draw."""
+        with params.to_module(self.actor_network):
+            dist = self.actor_network.get_dist(batch.select(*self.actor_network.in_keys))
+        return rsample_and_log_prob(dist)
+
+    def q(self, batch: TensorDictBase, action: Tensor, params: Any) -> Tensor:
+        """The critics' values ``[*B, critics]`` of ``action`` at the batch's observations."""
+        data = batch.select(*self.qvalue_network.in_keys, strict=False).set(self.tensor_keys.action, action)
+        if self._each is not None:
+            return self._each(data, params).get(self.tensor_keys.state_action_value).squeeze(-1).movedim(0, -1)
+        with params.to_module(self.qvalue_network):
+            return self.qvalue_network(data).get(self.tensor_keys.state_action_value)
+
+    def target(self, batch: TensorDictBase, next_value: Tensor) -> Tensor:
+        """The bootstrapped target ``[*B]`` of the next state's value ``[*B]``."""
+        keys, after = self.tensor_keys, batch["next"]
+        terminated, steps = after[keys.terminated], batch.get(keys.steps_to_next_obs, None)
+        return bootstrap_target(after[keys.reward], next_value.unsqueeze(-1), terminated, self.gamma, steps).squeeze(-1)
+
+    def weight(self, batch: TensorDictBase) -> Tensor | float:
+        """The importance weights ``[*B]`` of a prioritized replay, 1 for any other."""
+        return batch.get(self.tensor_keys.priority_weight, 1.0)
+
+    def write_priority(self, batch: TensorDictBase, td_error: Tensor) -> None:
+        """Writes the largest error of the critics, ``[*B, critics]`` in absolute value, into the batch."""
+        batch.set(self.tensor_keys.priority, td_error.detach().abs().amax(-1))
+
+    def make_value_estimator(self, value_type: ValueEstimators | None = None, **hyperparams: Any) -> QLoss:
+        """As in TorchRL: sets ``gamma``. One- and n-step targets come from the replay, so only ``TD0`` is known."""
+        if value_type not in (None, ValueEstimators.TD0):
+            raise NotImplementedError(f"{type(self).__name__} takes TD0; for n-step targets give the replay n_steps=")
+        if hyperparams.keys() - {"gamma"}:
+            raise TypeError(f"unknown settings of the value estimator: {', '.join(hyperparams.keys() - {'gamma'})}")
+        if "gamma" in hyperparams:
+            self.gamma.fill_(hyperparams["gamma"])
+        return self
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """Every entry that ``forward`` reads."""
+        if self._in_keys is None:
+            keys, networks = self.tensor_keys, [*self.actor_network.in_keys, *self.qvalue_network.in_keys]
+            after = [*self.actor_network.in_keys, keys.reward, keys.done, keys.terminated]
+            after = [("next", *((key,) if isinstance(key, str) else key)) for key in after]
+            self._in_keys = list(dict.fromkeys([keys.action, *networks, *after]))
+        return self._in_keys
+
+    @in_keys.setter
+    def in_keys(self, keys: list[NestedKey] | None) -> None:
+        self._in_keys = keys
+
+    def set_keys(self, **kwargs: NestedKey) -> None:
+        """As in TorchRL: renames the entries the loss reads."""
+        super().set_keys(**kwargs)
+        self._in_keys = None
+
+    def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
+        pass
