@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import signal
 import traceback
 import weakref
 from multiprocessing.connection import Connection
@@ -98,6 +99,7 @@ def _serve(
     shared: dict[NestedKey, Tensor],
 ) -> None:
     """A worker's life: answers ``(answer, failure)`` to every request until the pipe closes."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
     try:
         torch.set_num_threads(1)
         envs = ArrayEnv(cloudpickle.loads(make_env), count, seed, first)
@@ -114,7 +116,7 @@ def _serve(
             else:
                 envs.load_state_dict(argument)
             pipe.send((answer, None))
-    except (EOFError, KeyboardInterrupt, BrokenPipeError):
+    except (EOFError, BrokenPipeError):
         pass
     except Exception:
         pipe.send((None, traceback.format_exc()))

@@ -38,7 +38,7 @@ class ArrayEnv:
 
     def __init__(self, make_env: Callable[[], gym.Env], num_envs: int, seed: int = 0, first: int = 0) -> None:
         self.envs = [make_env() for _ in range(num_envs)]
-        self.num_envs, self.seed, self.first = num_envs, seed, first
+        self.num_envs, self.first = num_envs, first
         self._write, shape = _observation_writer(self.envs[0].observation_space)
         self._to_env = _action_converter(self.envs[0].action_space)
         self.obs = np.zeros((num_envs, *shape), np.float32)
@@ -46,11 +46,16 @@ class ArrayEnv:
         self._reward = np.zeros(num_envs, np.float32)
         self._terminated = np.zeros(num_envs, bool)
         self._truncated = np.zeros(num_envs, bool)
-        self.episode_reward = np.zeros(num_envs)
-        self.step_count = np.zeros(num_envs, np.int64)
-        self._fresh = np.zeros(num_envs, bool)  # reset, and not stepped since
-        self._episode = np.full(num_envs, -1)
-        self._history: list[list[Any]] = [[] for _ in range(num_envs)]
+        self.restart(seed)
+
+    def restart(self, seed: int) -> None:
+        """Back to the state of a new object with this seed; :meth:`reset` begins the first episodes."""
+        self.seed = seed
+        self.episode_reward = np.zeros(self.num_envs)
+        self.step_count = np.zeros(self.num_envs, np.int64)
+        self._fresh = np.zeros(self.num_envs, bool)  # reset, and not stepped since
+        self._episode = np.full(self.num_envs, -1)
+        self._history: list[list[Any]] = [[] for _ in range(self.num_envs)]
 
     def _begin(self, i: int) -> None:
         self._episode[i] += 1

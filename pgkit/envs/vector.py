@@ -71,7 +71,8 @@ class VectorEnv(EnvBase):
 
     def _set_seed(self, seed: int | None) -> None:
         self.seed = 0 if seed is None else seed
-        self.close_arrays()
+        if "arrays" in self.__dict__:
+            self.arrays.restart(self.seed)
 
     def close_arrays(self) -> None:
         if "arrays" in self.__dict__:

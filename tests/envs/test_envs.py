@@ -66,6 +66,11 @@ def test_every_env_has_its_own_stream_and_the_seed_decides():
 
     assert len(np.unique(obs(1)[:, 0])) == 3
     assert np.array_equal(obs(1), obs(1)) and not np.array_equal(obs(1), obs(2))
+    env = envs.make("Pendulum-v1", num_envs=3, seed=1)
+    env.arrays.reset()
+    env.arrays.step(np.zeros((3, 1), np.float32))
+    env.set_seed(2)
+    assert np.array_equal(env.arrays.reset(), obs(2))
 
 
 @pytest.mark.parametrize("env_id", ["CartPole-v1", "HalfCheetah-v5", "dm_control/cheetah-run-v0"])
