@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
-from torch import Tensor, nn
+from torch import Tensor
 
 from pgkit.functional import generalized_advantage
 
@@ -13,8 +15,8 @@ from pgkit.functional import generalized_advantage
 class GAE(TensorDictModuleBase):
     """Writes ``advantage``, ``value_target`` and ``state_value`` (``[*B, T, 1]``) into a rollout ``[*B, T]``.
 
-    Schulman et al., 2016 (https://arxiv.org/abs/1506.02438). The critic runs once on every observation, and again
-    only on the true final observations of episodes and on the rollout's last: elsewhere the next value is the
+    Schulman et al., 2016 (https://arxiv.org/abs/1506.02438). The critic runs once on every observation, and
+    besides only on the true final observations of episodes and the rollout's last: elsewhere the next value is the
     value one step on. This block owns gamma and lambda.
 
     Args:
@@ -36,7 +38,7 @@ class GAE(TensorDictModuleBase):
         gamma: float = 0.99,
         lmbda: float = 0.95,
         average_gae: bool = False,
-        return_scale: nn.Module | None = None,
+        return_scale: Any = None,
     ) -> None:
         super().__init__()
         self.critic, self.average_gae, self.return_scale = critic, average_gae, return_scale
@@ -50,11 +52,11 @@ class GAE(TensorDictModuleBase):
     def forward(self, rollout: TensorDictBase) -> TensorDictBase:
         """Reads and returns ``rollout``, which has time as its last batch dimension."""
         reward, done, terminated = (rollout["next", key] for key in ("reward", "done", "terminated"))
-        value = self._value(rollout)
-        next_value = torch.cat([value[..., 1:, :], torch.zeros_like(value[..., :1, :])], -2)
         own = done.squeeze(-1).clone()  # steps whose successor is not the next entry
         own[..., -1] = True
-        next_value[own] = self._value(rollout["next"][own])
+        value, final = self._values(rollout, own)
+        next_value = torch.cat([value[..., 1:, :], torch.zeros_like(value[..., :1, :])], -2)
+        next_value[own] = final
         scale = 1.0 if self.return_scale is None else self.return_scale.scale
         advantage, target = generalized_advantage(
             value * scale, next_value * scale, reward, done, terminated, self.gamma, self.lmbda
@@ -66,5 +68,10 @@ class GAE(TensorDictModuleBase):
         rollout.set("state_value", value)
         return rollout
 
-    def _value(self, data: TensorDictBase) -> Tensor:
-        return self.critic(data.select(*self.critic.in_keys))[self.critic.out_keys[0]]
+    def _values(self, rollout: TensorDictBase, own: Tensor) -> tuple[Tensor, Tensor]:
+        """Values of all observations ``[*B, T, 1]``, and of the next ones where ``own`` ``[own.sum(), 1]``."""
+        rows, dims = rollout.numel(), rollout.batch_dims
+        keys = self.critic.in_keys
+        both = {key: torch.cat([rollout[key].flatten(0, dims - 1), rollout["next"][key][own]]) for key in keys}
+        values = self.critic(TensorDict(both))[self.critic.out_keys[0]]
+        return values[:rows].reshape(*rollout.batch_size, 1), values[rows:]

@@ -47,9 +47,7 @@ def parser() -> Parser:
     command.set_defaults(command=copy_recipe)
 
     command = commands.add_parser("run", help="train with a recipe", usage="pgkit run RECIPE [FLAGS]")
-    command.add_argument(
-        "recipe", help="a name that pgkit ls shows, or a file; RECIPE --help lists its flags"
-    )
+    command.add_argument("recipe", help="a name that pgkit ls shows, or a file; RECIPE --help lists its flags")
     command.add_argument("flags", nargs=argparse.REMAINDER, help="the recipe's own").required = False
     command.set_defaults(command=run_recipe)
 
@@ -57,9 +55,7 @@ def parser() -> Parser:
     command.add_argument("run_dir", type=Path, metavar="RUN_DIR")
     command.add_argument("--episodes", type=positive, default=10, help="how many (default: 10)")
     command.add_argument("--seed", type=int, default=0, help="of the envs (default: 0)")
-    command.add_argument(
-        "--which", choices=["best", "latest"], default="best", help="checkpoint (default: best)"
-    )
+    command.add_argument("--which", choices=["best", "latest"], default="best", help="checkpoint (default: best)")
     command.set_defaults(command=evaluate_run)
 
     command = commands.add_parser("plot", help="draw the learning curves of runs; seeds are averaged")

@@ -33,7 +33,5 @@ def find(recipe: str) -> Path:
         return path
     if recipe not in names():
         close = ", ".join(difflib.get_close_matches(recipe, names(), cutoff=0.3) or names())
-        raise UserError(
-            f"no recipe named {recipe}; nearest: {close} (pgkit ls lists all; a file ends in .py)"
-        )
+        raise UserError(f"no recipe named {recipe}; nearest: {close} (pgkit ls lists all; a file ends in .py)")
     return recipes_dir() / f"{recipe}.py"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from tensordict import TensorDict
@@ -12,16 +13,16 @@ from torch import Tensor
 from torch.fx.experimental.proxy_tensor import make_fx
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-
 Act = Callable[[Tensor], tuple[Tensor, ...]]
 
 
 def output_keys(actor: TensorDictModuleBase) -> list[NestedKey]:
     """What a rollout keeps of an actor's outputs: its samples and their log-probabilities."""
-    samples = getattr(actor, "dist_sample_keys", None)
+    samples: Any = getattr(actor, "dist_sample_keys", None)
     if not samples:
         return list(actor.out_keys)
-    return [*samples, *[key for key in actor.log_prob_keys if key in actor.out_keys]]
+    log_probs: Any = actor.log_prob_keys
+    return [*samples, *[key for key in log_probs if key in actor.out_keys]]
 
 
 def trace(actor: TensorDictModuleBase, obs: Tensor) -> Act:

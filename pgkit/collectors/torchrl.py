@@ -38,9 +38,7 @@ class TorchRLCollector:
         env = TransformedEnv(env, Compose(RewardSum(), StepCounter()))
         self.frames = 0
         kwargs = {"trust_policy": True, "auto_register_policy_transforms": True} | kwargs
-        self.collector = Collector(
-            env, actor, frames_per_batch=frames_per_batch, total_frames=total_frames, **kwargs
-        )
+        self.collector = Collector(env, actor, frames_per_batch=frames_per_batch, total_frames=total_frames, **kwargs)
 
     def __iter__(self) -> Iterator[TensorDictBase]:
         for rollout in self.collector:

@@ -49,8 +49,8 @@ class VectorCollector:
             )
         if 0 <= total_frames < frames_per_batch:
             raise UserError(
-                f"total_frames={total_frames} is less than one rollout (frames_per_batch={frames_per_batch}): raise the "
-                "first or lower the second"
+                f"total_frames={total_frames} is less than one rollout (frames_per_batch={frames_per_batch}): raise "
+                "the first or lower the second"
             )
         self.env, self.actor = env, actor
         self.frames_per_batch, self.total_frames = frames_per_batch, total_frames
@@ -126,11 +126,13 @@ def _example(env: VectorEnv, actor: TensorDictModuleBase) -> tuple[Tensor, ...]:
             out = actor(data)
         except RuntimeError as error:
             reason = str(error.__cause__ or error).strip().splitlines()[-1]
-            raise UserError(f"the actor cannot read observations of shape {tuple(obs.shape[1:])}; {misfit} [{reason}]") from error
+            raise UserError(
+                f"the actor cannot read observations of shape {tuple(obs.shape[1:])}; {misfit} [{reason}]"
+            ) from error
     action = out["action"]
     if action.shape != spec.shape or action.dtype.is_floating_point != spec.dtype.is_floating_point:
         raise UserError(
-            f"the actor's action is {tuple(action.shape[1:])} {action.dtype}, the environment's {tuple(spec.shape[1:])} "
-            f"{spec.dtype}; {misfit}"
+            f"the actor's action is {tuple(action.shape[1:])} {action.dtype}, the environment's "
+            f"{tuple(spec.shape[1:])} {spec.dtype}; {misfit}"
         )
     return tuple(out[key] for key in output_keys(actor))

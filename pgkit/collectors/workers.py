@@ -6,6 +6,7 @@ import copy
 import signal
 import traceback
 import weakref
+from itertools import pairwise
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -27,7 +28,9 @@ class Workers:
     The rollout and the policy's weights are in shared memory: a rollout costs two messages a process.
     """
 
-    def __init__(self, env: VectorEnv, actor: TensorDictModuleBase, steps: int, outputs: dict[NestedKey, Tensor]) -> None:
+    def __init__(
+        self, env: VectorEnv, actor: TensorDictModuleBase, steps: int, outputs: dict[NestedKey, Tensor]
+    ) -> None:
         self._actor = copy.deepcopy(actor).requires_grad_(False).share_memory()
         obs = env.observation_spec["observation"].zero().numpy()
         shared = {k: torch.from_numpy(x).share_memory_() for k, x in allocate(steps, obs, outputs).items()}
@@ -36,7 +39,7 @@ class Workers:
         bounds = [round(i * env.num_envs / env.workers) for i in range(env.workers + 1)]
         self._pipes: list[Connection] = []
         processes = []
-        for first, end in zip(bounds, bounds[1:], strict=False):
+        for first, end in pairwise(bounds):
             ours, theirs = context.Pipe()
             make_env = cloudpickle.dumps(env.make_env)
             args = (theirs, make_env, first, end - first, env.num_envs, env.seed, self._actor, shared)
@@ -66,7 +69,7 @@ class Workers:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Gives every process its share of :meth:`state_dict`."""
-        cuts = [slice(a, b) for a, b in zip(self._bounds, self._bounds[1:], strict=False)]
+        cuts = [slice(a, b) for a, b in pairwise(self._bounds)]
         parts = [{**state, "episode": state["episode"][c], "history": state["history"][c]} for c in cuts]
         self._ask([("load", part) for part in parts])
 

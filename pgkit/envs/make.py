@@ -57,8 +57,7 @@ def make_one(env_id: str, **kwargs: Any) -> gym.Env:
     except (gym.error.DependencyNotInstalled, ImportError) as error:
         reason = str(error).splitlines()[0].rstrip(".")
         raise UserError(
-            f"environment '{env_id}' needs a package that is not installed ({reason}): "
-            f'pip install "{_extra(env_id)}"'
+            f"environment '{env_id}' needs a package that is not installed ({reason}): pip install \"{_extra(env_id)}\""
         ) from error
 
 

@@ -30,9 +30,7 @@ class VectorEnv(EnvBase):
         workers: processes that collect with this environment (1: the calling process).
     """
 
-    def __init__(
-        self, make_env: Callable[[], gym.Env], num_envs: int = 1, seed: int = 0, workers: int = 1
-    ) -> None:
+    def __init__(self, make_env: Callable[[], gym.Env], num_envs: int = 1, seed: int = 0, workers: int = 1) -> None:
         super().__init__(device=None, batch_size=torch.Size([num_envs]))
         self.make_env, self.num_envs, self.seed, self.workers = make_env, num_envs, seed, workers
         probe = make_env()

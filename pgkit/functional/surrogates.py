@@ -17,13 +17,13 @@ def clip_surrogate(
     r"""PPO's clipped surrogate (Schulman et al., 2017, https://arxiv.org/abs/1707.06347, eq. 7).
 
     .. math::
-        \min\big(r A,\ \text{clip}(r, 1 - \epsilon_{low}, 1 + \epsilon_{high}) A\big), \qquad r = e^{\text{log-ratio}}
+        \min\big(r A,\ \text{clip}(r, 1 - \epsilon_{low}, 1 + \epsilon_{high}) A\big), \qquad r = \pi / \pi_{old}
 
     Args:
         log_ratio: :math:`\log \pi(a|s) - \log \pi_{old}(a|s)`, any shape.
         advantage: same shape.
         clip_low: :math:`\epsilon_{low}`.
-        clip_high: :math:`\epsilon_{high}`; ``clip_low`` if None (DAPO, https://arxiv.org/abs/2503.14476, has it larger).
+        clip_high: :math:`\epsilon_{high}`; ``clip_low`` if None (larger in DAPO, https://arxiv.org/abs/2503.14476).
 
     Returns:
         Same shape, unreduced.

@@ -125,7 +125,7 @@ class PolicyLoss(LossModule):
             networks = [net for net in (self.actor_network, self.critic_network) if net is not None]
             keys = [key for net in networks for key in net.in_keys]
             self._in_keys = list(dict.fromkeys([*keys, *self._read_keys()]))
-        return self._in_keys
+        return list(self._in_keys)
 
     @in_keys.setter
     def in_keys(self, keys: list[NestedKey] | None) -> None:
@@ -151,5 +151,3 @@ class PolicyLoss(LossModule):
 def standardize(x: Tensor) -> Tensor:
     """Zero mean and unit standard deviation over all elements, which is what PPO does to a minibatch's advantage."""
     return (x - x.mean()) / x.std().clamp_min(1e-6)
-
-

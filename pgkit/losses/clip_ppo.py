@@ -10,7 +10,14 @@ from tensordict.nn import TensorDictModule, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from pgkit.functional import approx_kl, clip_surrogate, clipped_value_loss, explained_variance, same_shape, value_loss
+from pgkit.functional import (
+    approx_kl,
+    clip_surrogate,
+    clipped_value_loss,
+    explained_variance,
+    same_shape,
+    value_loss,
+)
 from pgkit.losses.base import PolicyLoss, standardize
 
 Surrogate = Callable[[Tensor, Tensor], Tensor]
@@ -49,6 +56,12 @@ class ClipPPOLoss(PolicyLoss):
         {"clip_low", "clip_high", "entropy_coeff", "critic_coeff", "clip_value"}
     )
 
+    clip_low: Tensor
+    clip_high: Tensor
+    entropy_coeff: Tensor
+    critic_coeff: Tensor
+    clip_value: Tensor | None
+
     def __init__(
         self,
         actor_network: TensorDictModule,
@@ -69,7 +82,9 @@ class ClipPPOLoss(PolicyLoss):
         super().__init__(actor_network, critic, separate_losses=separate_losses, reduction=reduction)
         low, high = clip_epsilon if isinstance(clip_epsilon, tuple | list) else (clip_epsilon, clip_epsilon)
         if clip_value is True and low != high:
-            raise ValueError("clip_value=True takes clip_epsilon's value, which is a pair here: give clip_value a number")
+            raise ValueError(
+                "clip_value=True takes clip_epsilon's value, which is a pair here: give clip_value a number"
+            )
         self.register_coeff_buffer("clip_low", low)
         self.register_coeff_buffer("clip_high", high)
         self.register_coeff_buffer("entropy_coeff", entropy_coeff)
@@ -86,7 +101,7 @@ class ClipPPOLoss(PolicyLoss):
             entropy = ["loss_entropy", "entropy"] if self.entropy_bonus else []
             critic = [] if self.critic_network is None else ["loss_critic", "explained_variance"]
             self._out_keys = ["loss_objective", *entropy, *critic, "approx_kl", "clip_fraction"]
-        return self._out_keys
+        return list(self._out_keys)
 
     @out_keys.setter
     def out_keys(self, keys: list[NestedKey]) -> None:
@@ -101,7 +116,10 @@ class ClipPPOLoss(PolicyLoss):
             advantage = standardize(advantage)
 
         dist = self.distribution(batch)
-        log_prob, old_log_prob = dist.log_prob(batch[self.tensor_keys.action]), batch[self.tensor_keys.sample_log_prob]
+        log_prob, old_log_prob = (
+            dist.log_prob(batch[self.tensor_keys.action]),
+            batch[self.tensor_keys.sample_log_prob],
+        )
         same_shape(log_prob=log_prob, old_log_prob=old_log_prob)
         log_ratio = (log_prob - old_log_prob).unsqueeze(-1)
         objective = self.surrogate(log_ratio, advantage)

@@ -67,7 +67,7 @@ def tanh_normal_actor(
         tanh_loc: bound the mean before the tanh.
         hidden, activation, normalizer, encoder: as in :func:`gaussian_actor`.
     """
-    space = box_action(env, needs_bounds=True).space
+    space: Any = box_action(env, needs_bounds=True).space
     layers, features = trunk(env, hidden, activation, normalizer, encoder)
     head = StateDependentHead(features, action_size(env), log_std_bounds)
     kwargs = {"low": space.low, "high": space.high, "tanh_loc": tanh_loc, "event_dims": 1}
@@ -87,7 +87,7 @@ def categorical_actor(
     The action is an index where the spec is TorchRL's ``Categorical`` (pgkit's environments), one-hot where it is
     ``OneHot`` (TorchRL's ``GymEnv`` by default). Arguments as in :func:`gaussian_actor`.
     """
-    spec = env.action_spec_unbatched
+    spec: Any = env.action_spec_unbatched
     if spec.dtype.is_floating_point or not hasattr(spec.space, "n"):
         raise UserError(
             f"categorical_actor needs a discrete action, the environment's is {spec.__class__.__name__}: "

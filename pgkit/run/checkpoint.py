@@ -48,6 +48,4 @@ def restore(tracked: dict[str, Stateful], states: dict[str, Any], where: Path) -
             owner.load_state_dict(states[name])
         except (RuntimeError, KeyError) as error:
             reason = " ".join(str(error).split())[:200]
-            raise UserError(
-                f"{where}: the state of {name} does not fit what the recipe built ({reason})"
-            ) from error
+            raise UserError(f"{where}: the state of {name} does not fit what the recipe built ({reason})") from error

@@ -27,9 +27,7 @@ def choose(args: RunArgs, recipe: str) -> Path:
     if path.exists() and not path.is_dir():
         raise UserError(f"--run-dir {path} is a file; give a directory")
     if holds_run(path):
-        raise UserError(
-            f"{path} already holds a run: give another --run-dir, or go on with it by --resume {path}"
-        )
+        raise UserError(f"{path} already holds a run: give another --run-dir, or go on with it by --resume {path}")
     return path
 
 

@@ -76,9 +76,7 @@ def finished_episodes(rollout: TensorDictBase | None) -> list[tuple[float, int]]
     if rollout is None or ("next", "episode_reward") not in rollout.keys(include_nested=True):
         return []
     done = rollout["next", "done"].squeeze(-1).T
-    rewards, lengths = (
-        rollout["next", name].squeeze(-1).T[done] for name in ("episode_reward", "step_count")
-    )
+    rewards, lengths = (rollout["next", name].squeeze(-1).T[done] for name in ("episode_reward", "step_count"))
     return list(zip(rewards.tolist(), lengths.tolist(), strict=True))
 
 

@@ -30,9 +30,7 @@ def plot(run_dirs: Sequence[str | Path], out: str | Path) -> None:
             raise UserError(f"{run_dir} has no metrics.csv: nothing was logged there yet")
         groups[config["settings"]["env_id"]][config["recipe"]].append(run_dir)
     figure = Figure(figsize=(6.4 * len(groups), 4.2), layout="constrained")
-    for axes, (env_id, recipes) in zip(
-        figure.subplots(1, len(groups), squeeze=False)[0], groups.items(), strict=True
-    ):
+    for axes, (env_id, recipes) in zip(figure.subplots(1, len(groups), squeeze=False)[0], groups.items(), strict=True):
         for number, (recipe, members) in enumerate(recipes.items()):
             rows = [read_csv(member / "metrics.csv")[1] for member in members]
             seeds = f" ({len(rows)} seeds)" if len(rows) > 1 else ""
@@ -72,9 +70,7 @@ def _draw(axes: Any, curves: list[Curve], label: str, **style: Any) -> None:
     frames, mean, deviation = mean_and_band(curves)
     axes.plot(frames, mean, label=label, **style)
     if len(curves) > 1:
-        axes.fill_between(
-            frames, mean - deviation, mean + deviation, color=style["color"], alpha=0.15, linewidth=0
-        )
+        axes.fill_between(frames, mean - deviation, mean + deviation, color=style["color"], alpha=0.15, linewidth=0)
 
 
 def _frames(value: float, _: int | None) -> str:

@@ -54,9 +54,7 @@ class Run:
     def _load(self) -> dict[str, Any]:
         config = directory.read_config(self.dir)
         if config["recipe"] != self.recipe:
-            raise UserError(
-                f"{self.dir} holds a run of {config['recipe']}, not of {self.recipe}: use that recipe"
-            )
+            raise UserError(f"{self.dir} holds a run of {config['recipe']}, not of {self.recipe}: use that recipe")
         saved = checkpoint.load(self.dir / "checkpoints" / "latest.pt")
         if self.args.total_frames <= saved["frames"]:
             raise UserError(
@@ -71,9 +69,7 @@ class Run:
             self._handler = signal.signal(signal.SIGINT, self._interrupt)
         return self
 
-    def track(
-        self, *, policy: torch.nn.Module, eval_env: Callable[..., Any], **stateful: checkpoint.Stateful
-    ) -> None:
+    def track(self, *, policy: torch.nn.Module, eval_env: Callable[..., Any], **stateful: checkpoint.Stateful) -> None:
         """Name what to evaluate and what to save; on a resume, load the checkpoint into it.
 
         Args:
@@ -125,9 +121,7 @@ class Run:
             "rollout/ep_rew_mean": mean(reward for reward, _ in self._episodes) if self._episodes else NAN,
             "rollout/ep_len_mean": mean(length for _, length in self._episodes) if self._episodes else NAN,
         }
-        row |= {
-            name if "/" in name else f"train/{name}": float(value) for name, value in (metrics or {}).items()
-        }
+        row |= {name if "/" in name else f"train/{name}": float(value) for name, value in (metrics or {}).items()}
         self._live.update(frames, row["rollout/ep_rew_mean"], row["time/fps"])
         if due:
             row |= self._evaluate(row)
@@ -151,9 +145,7 @@ class Run:
             self._evaluated = {"frames": self.frames, **scores}
             if scores["eval/mean_reward"] > self.best.get("eval/mean_reward", -float("inf")):
                 self.best = self._evaluated
-        self._live.evaluated(
-            self.frames, row.get("rollout/ep_rew_mean", NAN), row.get("time/fps", NAN), scores
-        )
+        self._live.evaluated(self.frames, row.get("rollout/ep_rew_mean", NAN), row.get("time/fps", NAN), scores)
         return scores
 
     def save(self) -> None:

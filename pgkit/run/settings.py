@@ -82,9 +82,7 @@ def parse(args_class: type[A], presets: Presets, argv: Sequence[str]) -> A:
     else:
         pattern, preset = first_match(presets, given.env_id or defaults.env_id)
     base = dataclasses.replace(defaults, **preset)
-    args = tyro.cli(
-        args_class, default=base, args=list(argv), prog=_program(), description=main_doc(args_class)
-    )
+    args = tyro.cli(args_class, default=base, args=list(argv), prog=_program(), description=main_doc(args_class))
     if given.resume:
         _check_resumed(base, args)
     elif shown := [f"{name}={value}" for name, value in preset.items() if getattr(args, name) == value]:
@@ -132,9 +130,7 @@ def _saved_settings(args_class: type[RunArgs], run_dir: Path) -> dict[str, Any]:
     saved = config["settings"]
     if unknown := saved.keys() - hints.keys():
         names = ", ".join(sorted(unknown))
-        raise UserError(
-            f"--resume {run_dir}: that is a run of {config['recipe']}; this recipe has no setting {names}"
-        )
+        raise UserError(f"--resume {run_dir}: that is a run of {config['recipe']}; this recipe has no setting {names}")
     saved |= {"run_dir": str(run_dir), "resume": str(run_dir)}
     return {name: _typed(value, hints[name]) for name, value in saved.items()}
 

@@ -116,6 +116,4 @@ CONTENDERS = {
 
 if __name__ == "__main__":
     options = tyro.cli(Options, description=__doc__)
-    contest.write(
-        options.json, contest.run("PPO, HalfCheetah-v5, 8 envs x 256", options, CONTENDERS, "pgkit")
-    )
+    contest.write(options.json, contest.run("PPO, HalfCheetah-v5, 8 envs x 256", options, CONTENDERS, "pgkit"))

@@ -75,9 +75,7 @@ def steps(calls: int) -> dict[str, float]:
         for name, make in (("pgkit loss", pgkit_loss), ("TorchRL ClipPPOLoss", torchrl_parts.ppo_loss)):
             loss = make(*agent())
             step, flat = pgkit_step(loss, rollout, compiled)
-            results[f"{name}, pgkit's step, {how}"] = contest.milliseconds(
-                partial(step, flat, index), calls, warmup=20
-            )
+            results[f"{name}, pgkit's step, {how}"] = contest.milliseconds(partial(step, flat, index), calls, warmup=20)
         loss = torchrl_parts.ppo_loss(*agent())
         update, flat = torchrl_parts.ppo_update(loss, compiled=compiled), rollout.reshape(-1)
         name = f"TorchRL ClipPPOLoss, TorchRL's way, {'torch.compile(update)' if compiled else how}"
@@ -120,15 +118,11 @@ def frames(rollouts: int) -> dict[str, float]:
     results = {"Gymnasium stepping alone, random actions": gymnasium_frame(rollouts)}
     for workers in (1, 2):
         env = envs.make(ENV_ID, num_envs=NUM_ENVS, seed=1, workers=workers)
-        collector = collectors.VectorCollector(
-            env, agent()[0], frames_per_batch=NUM_ENVS * STEPS, total_frames=10**12
-        )
+        collector = collectors.VectorCollector(env, agent()[0], frames_per_batch=NUM_ENVS * STEPS, total_frames=10**12)
         results[f"pgkit VectorCollector, {workers} worker{'s' * (workers > 1)}"] = frame(collector, rollouts)
         collector.shutdown()
     env = torchrl_parts.make_env(ENV_ID, NUM_ENVS)
-    collector = Collector(
-        env, torchrl_parts.ppo_nets(env)[0], frames_per_batch=NUM_ENVS * STEPS, total_frames=-1
-    )
+    collector = Collector(env, torchrl_parts.ppo_nets(env)[0], frames_per_batch=NUM_ENVS * STEPS, total_frames=-1)
     results["TorchRL Collector, SerialEnv"] = frame(collector, rollouts)
     collector.shutdown()
     return results

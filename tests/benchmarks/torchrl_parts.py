@@ -75,9 +75,7 @@ def ppo_update(
 ) -> Update:
     """One minibatch step as TorchRL's examples write it; returns the detached losses."""
     parameters = list(loss.parameters())
-    optimizer = torch.optim.Adam(
-        parameters, lr=torch.tensor(learning_rate) if compiled else learning_rate, eps=1e-5
-    )
+    optimizer = torch.optim.Adam(parameters, lr=torch.tensor(learning_rate) if compiled else learning_rate, eps=1e-5)
 
     def update(batch: TensorDictBase) -> TensorDictBase:
         optimizer.zero_grad(set_to_none=True)
@@ -128,14 +126,10 @@ def sac_nets(env: EnvBase, hidden: tuple[int, ...] = (256, 256)) -> tuple[Probab
         distribution_kwargs={"low": space.low, "high": space.high, "tanh_loc": False},
         return_log_prob=False,
     )
-    return actor, ValueOperator(
-        body(in_features=sizes + actions, out_features=1), in_keys=["action", "observation"]
-    )
+    return actor, ValueOperator(body(in_features=sizes + actions, out_features=1), in_keys=["action", "observation"])
 
 
-def sac_update(
-    loss: SACLoss, learning_rate: float = 3e-4, tau: float = 0.005, compiled: bool = False
-) -> Update:
+def sac_update(loss: SACLoss, learning_rate: float = 3e-4, tau: float = 0.005, compiled: bool = False) -> Update:
     """One SAC step as TorchRL's example writes it: losses summed, one Adam, then the target nets."""
     targets = SoftUpdate(loss, tau=tau)
     optimizer = torch.optim.Adam(
@@ -173,9 +167,7 @@ def sac(
     )
     loss.make_value_estimator(gamma=0.99)
     update = sac_update(loss, compiled=compiled)
-    collector = Collector(
-        env, actor, frames_per_batch=chunk, total_frames=-1, init_random_frames=random_frames
-    )
+    collector = Collector(env, actor, frames_per_batch=chunk, total_frames=-1, init_random_frames=random_frames)
     replay = TensorDictReplayBuffer(storage=LazyTensorStorage(buffer), batch_size=batch_size)
     frames = 0
     for data in collector:

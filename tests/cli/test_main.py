@@ -61,9 +61,7 @@ if __name__ == "__main__":
 def pgkit(*words: str, cwd: Path) -> subprocess.CompletedProcess[str]:
     code = "from pgkit.cli.main import main; main()"
     command = [sys.executable, "-W", "error", "-c", code, *words]
-    return subprocess.run(
-        command, cwd=cwd, env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True
-    )
+    return subprocess.run(command, cwd=cwd, env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True)
 
 
 @pytest.fixture(scope="module")
@@ -150,9 +148,7 @@ def test_user_errors(inside: Path, capsys: pytest.CaptureFixture[str], words: li
 def shelf(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Two shipped recipes."""
     (tmp_path / "shelf").mkdir()
-    (tmp_path / "shelf/ppo.py").write_text(
-        '"""Proximal policy optimization.\n\nMore."""\nraise SystemExit("ran")\n'
-    )
+    (tmp_path / "shelf/ppo.py").write_text('"""Proximal policy optimization.\n\nMore."""\nraise SystemExit("ran")\n')
     (tmp_path / "shelf/sac.py").write_text('"""Soft actor-critic."""\n')
     monkeypatch.setattr(recipes, "recipes_dir", lambda: tmp_path / "shelf")
     return tmp_path

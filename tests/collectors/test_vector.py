@@ -14,6 +14,10 @@ def make(env_id="Pendulum-v1", workers=1, num_envs=4, steps=50, **kwargs):
     return actor, collectors.VectorCollector(env, actor, frames_per_batch=num_envs * steps, **kwargs)
 
 
+def head_of(actor):
+    return actor.get_submodule("module.0.module")[-1]
+
+
 def equal(a, b):
     return set(a.keys(True, True)) == set(b.keys(True, True)) and bool((a == b).all())
 
@@ -73,11 +77,11 @@ def test_new_weights_take_effect_and_the_global_generator_does_not():
     _, again = make()
     assert equal(a, again.rollout())
     with torch.no_grad():
-        actor.module[0].module[-1].log_std.fill_(-20.0)
+        head_of(actor).log_std.fill_(-20.0)
     quiet = collector.rollout()
     mean = actor.get_dist(quiet.select("observation")).base_dist.loc
     torch.testing.assert_close(quiet["action"], mean)
-    actor.module[0].module[-1].log_std = torch.nn.Parameter(torch.zeros(1))  # replaced, not changed in place
+    head_of(actor).log_std = torch.nn.Parameter(torch.zeros(1))  # replaced, not changed in place
     assert (collector.rollout()["action"] - mean).abs().max() > 0.5
 
 

@@ -45,9 +45,7 @@ def test_value_of_an_endless_chain():
     value = torch.full((1, 20, 1), 1 / (1 - gamma), dtype=torch.float64)
     done = torch.zeros(1, 20, 1, dtype=torch.bool)
     done[:, 4::5] = True
-    flat = generalized_advantage(
-        value, value, torch.ones_like(value), done, torch.zeros_like(done), gamma, 0.95
-    )[0]
+    flat = generalized_advantage(value, value, torch.ones_like(value), done, torch.zeros_like(done), gamma, 0.95)[0]
     assert flat.abs().max() < 1e-12
     ended = generalized_advantage(value, value, torch.ones_like(value), done, done, gamma, 0.95)[0]
     assert ended[:, 4] == pytest.approx(1 - 10)  # as a termination it would lose the future

@@ -40,7 +40,10 @@ def test_agrees_with_torchrl(agent, kwargs):
     env, actor, critic = agent
     batch = make_batch(actor, env)
     settings = {"normalize_advantage": False, "entropy_coeff": 0.0, "loss_critic_type": "l2"} | kwargs
-    mine, theirs = losses.ClipPPOLoss(actor, critic, **settings), TorchRLClipPPOLoss(actor, critic, **settings)
+    mine, theirs = (
+        losses.ClipPPOLoss(actor, critic, **settings),
+        TorchRLClipPPOLoss(actor, critic, **settings),
+    )
     a, b = mine(batch), theirs(batch.copy())
     shared = [key for key in a.keys() if key in b.keys()]
     assert {"loss_objective", "loss_critic", "clip_fraction", "explained_variance"} <= set(shared)

@@ -10,10 +10,10 @@ from pgkit.errors import UserError
 def test_orthogonal_gains():
     torch.manual_seed(0)
     net = modules.mlp(10, 3, (32,), out_gain=0.01)
-    first, last = net[0].weight, net[2].weight
+    first, last = (net.get_parameter(f"{i}.weight") for i in (0, 2))
     torch.testing.assert_close(first.T @ first, 2 * torch.eye(10), atol=1e-4, rtol=1e-4)
     torch.testing.assert_close(last @ last.T, 1e-4 * torch.eye(3), atol=1e-7, rtol=1e-3)
-    assert first.count_nonzero() > 0 and net[0].bias.count_nonzero() == 0
+    assert first.count_nonzero() > 0 and net.get_parameter("0.bias").count_nonzero() == 0
 
 
 @pytest.mark.parametrize("make", [lambda: envs.make("Pendulum-v1", num_envs=4), lambda: GymEnv("Pendulum-v1")])

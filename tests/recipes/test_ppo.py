@@ -57,7 +57,10 @@ def test_runs_for_a_few_hundred_frames(tmp_path, flags):
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
-        (("--env-id", "CartPol-v1"), "unknown environment id 'CartPol-v1'; the nearest names are CartPole-v1"),
+        (
+            ("--env-id", "CartPol-v1"),
+            "unknown environment id 'CartPol-v1'; the nearest names are CartPole-v1",
+        ),
         (("--total-frames", 10), "total_frames=10 is less than one rollout"),
         (("--num-envs", 2, "--workers", 3), "every worker needs at least one environment"),
     ],
@@ -69,7 +72,20 @@ def test_bad_input_is_one_line_and_leaves_nothing_behind(tmp_path, flags, messag
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("env_id", "frames", "threshold"), [("CartPole-v1", 100_000, 500), ("Pendulum-v1", 200_000, -200)])
+@pytest.mark.parametrize(
+    ("env_id", "frames", "threshold"), [("CartPole-v1", 100_000, 500), ("Pendulum-v1", 200_000, -200)]
+)
 def test_reaches_the_known_score(tmp_path, env_id, frames, threshold):
-    pgkit("run", "ppo", "--env-id", env_id, "--seed", 11, "--total-frames", frames, "--run-dir", tmp_path / "run")
+    pgkit(
+        "run",
+        "ppo",
+        "--env-id",
+        env_id,
+        "--seed",
+        11,
+        "--total-frames",
+        frames,
+        "--run-dir",
+        tmp_path / "run",
+    )
     assert json.loads((tmp_path / "run" / "summary.json").read_text())["eval/mean_reward"] >= threshold

@@ -75,9 +75,7 @@ def linear_policy(weight: float = 0.0) -> TensorDictModule:
     return TensorDictModule(linear, in_keys=["observation"], out_keys=["action"])
 
 
-def train(
-    args: RunArgs, recipe: str = "walk", hook: Callable[[int], None] | None = None, **extra: Any
-) -> run.Run:
+def train(args: RunArgs, recipe: str = "walk", hook: Callable[[int], None] | None = None, **extra: Any) -> run.Run:
     """Ten frames a step; the one metric is drawn from the global generator, so it shows where that stands."""
     with run.Run(args, recipe) as log:
         counter = Counter()

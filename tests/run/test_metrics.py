@@ -17,9 +17,7 @@ def write(run_dir: Path, *rows: dict[str, float], upto: int = 0) -> Path:
 
 
 def test_a_new_column_is_added_to_the_header_and_left_empty_above(tmp_path: Path):
-    path = write(
-        tmp_path, {"frames": 1, "a": 0.5}, {"frames": 2, "a": 0.25, "eval/x": 3.0}, {"frames": 3, "a": 1.0}
-    )
+    path = write(tmp_path, {"frames": 1, "a": 0.5}, {"frames": 2, "a": 0.25, "eval/x": 3.0}, {"frames": 3, "a": 1.0})
     assert path.read_text().splitlines() == ["frames,a,eval/x", "1,0.5,", "2,0.25,3.0", "3,1.0,"]
 
 

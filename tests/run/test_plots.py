@@ -26,9 +26,7 @@ def saved_run(path: Path, env_id: str, text: str) -> Path:
 
 def test_several_runs_and_envs_make_one_figure(tmp_path: Path):
     text = "frames,rollout/ep_rew_mean,eval/mean_reward\n10,,\n20,1.0,2.0\n30,2.0,\n"
-    runs = [
-        saved_run(tmp_path / name, env, text) for name, env in (("a", "X-v0"), ("b", "X-v0"), ("c", "Y-v0"))
-    ]
+    runs = [saved_run(tmp_path / name, env, text) for name, env in (("a", "X-v0"), ("b", "X-v0"), ("c", "Y-v0"))]
     run.plot(runs, tmp_path / "out.svg")
     assert (tmp_path / "out.svg").read_text().startswith("<?xml")
 

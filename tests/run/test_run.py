@@ -21,10 +21,7 @@ def arguments(path: Path, total: int = 40, **settings: Any) -> RunArgs:
 
 def rows(path: Path, timed: bool = False) -> list[Row]:
     with (path / "metrics.csv").open(newline="") as file:
-        return [
-            {k: v for k, v in row.items() if timed or not k.startswith("time/")}
-            for row in csv.DictReader(file)
-        ]
+        return [{k: v for k, v in row.items() if timed or not k.startswith("time/")} for row in csv.DictReader(file)]
 
 
 def test_a_run_leaves_what_the_design_promises(kit: SimpleNamespace, tmp_path: Path, capsys: Any):
@@ -60,9 +57,7 @@ def test_evaluating_does_not_change_the_training(kit: SimpleNamespace, tmp_path:
     seldom = arguments(tmp_path / "seldom")
     seldom.eval_every = 0
     kit.train(seldom)
-    assert [r["train/draw"] for r in rows(tmp_path / "often")] == [
-        r["train/draw"] for r in rows(tmp_path / "seldom")
-    ]
+    assert [r["train/draw"] for r in rows(tmp_path / "often")] == [r["train/draw"] for r in rows(tmp_path / "seldom")]
 
 
 def test_forty_frames_equal_twenty_and_twenty_more(kit: SimpleNamespace, tmp_path: Path):
@@ -160,9 +155,7 @@ def test_stopping_early_is_a_break(kit: SimpleNamespace, tmp_path: Path):
     assert json.loads((tmp_path / "r/summary.json").read_text())["frames"] == 10
 
 
-def test_the_default_directory_names_env_recipe_and_seed(
-    kit: SimpleNamespace, tmp_path: Path, monkeypatch: Any
-):
+def test_the_default_directory_names_env_recipe_and_seed(kit: SimpleNamespace, tmp_path: Path, monkeypatch: Any):
     monkeypatch.chdir(tmp_path)
     args = arguments(tmp_path)
     args.run_dir = None

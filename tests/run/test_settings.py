@@ -48,9 +48,7 @@ def saved_run(path: Path, **settings: object) -> Path:
 
 
 def test_resume_takes_the_saved_settings_and_not_the_preset(tmp_path: Path):
-    run_dir = saved_run(
-        tmp_path / "r", env_id="CartPole-v1", hidden=[8, 8], learning_rate=0.7, total_frames=10
-    )
+    run_dir = saved_run(tmp_path / "r", env_id="CartPole-v1", hidden=[8, 8], learning_rate=0.7, total_frames=10)
     args = parse(Args, PRESETS, ["--resume", str(run_dir), "--total-frames", "99"])
     assert (args.hidden, args.learning_rate, args.total_frames) == ((8, 8), 0.7, 99)
     assert args.run_dir == args.resume == run_dir

@@ -38,7 +38,11 @@ class Identity(gym.Env):
     [
         (True, modules.categorical_actor, 15.9),
         (False, modules.gaussian_actor, -1.5),
-        (False, lambda env, hidden: modules.tanh_normal_actor(env, hidden, tanh_loc=True, log_std_bounds=(-3, -1)), -1.5),
+        (
+            False,
+            lambda env, hidden: modules.tanh_normal_actor(env, hidden, tanh_loc=True, log_std_bounds=(-3, -1)),
+            -1.5,
+        ),
     ],
 )
 def test_learns_the_identity(discrete, build, threshold):

@@ -1,3 +1,5 @@
+from typing import Any
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -37,9 +39,7 @@ def parameters(update):
 
 @pytest.mark.parametrize("loss_class", [losses.ClipPPOLoss, TorchRLClipPPOLoss])
 def test_eager_and_compiled_agree(loss_class):
-    eager, compiled = (
-        make_agent(dtype=torch.float64, loss_class=loss_class, compile=mode) for mode in ("off", "on")
-    )
+    eager, compiled = (make_agent(dtype=torch.float64, loss_class=loss_class, compile=mode) for mode in ("off", "on"))
     for i in range(20):
         a, b = (update(make_rollout(i, torch.float64)) for update in (eager, compiled))
         assert a.keys() == b.keys()
@@ -77,7 +77,8 @@ def test_optimizer_steps_as_torch_would(optimizer):
     for i in range(3):
         rollout = make_rollout(i, torch.float64)
         update(rollout)
-        batch = twin.advantage(make_rollout(i, torch.float64)).reshape(-1)
+        estimate: Any = twin.advantage
+        batch = estimate(make_rollout(i, torch.float64)).reshape(-1)
         order = torch.randperm(128, generator=twin._generator)
         out = twin.loss(batch[order])
         twin.optimizer.zero_grad()
@@ -132,8 +133,9 @@ def test_schedules_reach_optimizer_and_loss():
 
 def test_recompute_advantage_uses_the_new_critic():
     update, calls = make_agent(epochs=3, recompute_advantage=True), []
-    gae = update.advantage.forward
-    update.advantage.forward = lambda rollout: (calls.append(gae(rollout)["advantage"].clone()), rollout)[1]
+    block: Any = update.advantage
+    gae = block.forward
+    block.forward = lambda rollout: (calls.append(gae(rollout)["advantage"].clone()), rollout)[1]
     update(make_rollout())
     assert len(calls) == 3 and not torch.equal(calls[0], calls[1])
 
