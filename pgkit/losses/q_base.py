@@ -94,7 +94,7 @@ class QLoss(LossModule):
 
     def act(self, batch: TensorDictBase, params: Any) -> tuple[Tensor, Tensor]:
         """An action drawn from the policy at the batch's observations, and its log-probability ``[*B]``: one draw."""
-        with params.to_module(self.actor_network):
+        with params.to_module(self.actor_network, preserve_module_state=False):
             dist = self.actor_network.get_dist(batch.select(*self.actor_network.in_keys))
         return rsample_and_log_prob(dist)
 
@@ -103,7 +103,7 @@ class QLoss(LossModule):
         data = batch.select(*self.qvalue_network.in_keys, strict=False).set(self.tensor_keys.action, action)
         if self._each is not None:
             return self._each(data, params).get(self.tensor_keys.state_action_value).squeeze(-1).movedim(0, -1)
-        with params.to_module(self.qvalue_network):
+        with params.to_module(self.qvalue_network, preserve_module_state=False):
             return self.qvalue_network(data).get(self.tensor_keys.state_action_value)
 
     def target(self, batch: TensorDictBase, next_value: Tensor) -> Tensor:

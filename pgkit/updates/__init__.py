@@ -1,6 +1,7 @@
 """Updates: one call trains on one rollout or on replayed batches, as one compiled graph a step."""
 
+from pgkit.updates.off_policy import OffPolicyUpdate
 from pgkit.updates.on_policy import OnPolicyUpdate
 from pgkit.updates.step import GradientStep
 
-__all__ = ["GradientStep", "OnPolicyUpdate"]
+__all__ = ["GradientStep", "OffPolicyUpdate", "OnPolicyUpdate"]

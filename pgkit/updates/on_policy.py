@@ -56,7 +56,9 @@ class OnPolicyUpdate:
         if schedules and total_frames is None:
             raise UserError("schedules are functions of the progress: give total_frames too")
         if normalize_advantage and getattr(loss, "normalize_advantage", False):
-            raise UserError(f"{type(loss).__name__} normalizes the advantage already: leave normalize_advantage out here")
+            raise UserError(
+                f"{type(loss).__name__} normalizes the advantage already: leave normalize_advantage out here"
+            )
         self.loss, self.advantage, self.optimizer = loss, advantage, optimizer
         self.epochs, self.minibatch_size, self.max_grad_norm = epochs, minibatch_size, max_grad_norm
         self.recompute_advantage, self.normalize_advantage = recompute_advantage, normalize_advantage
@@ -89,7 +91,10 @@ class OnPolicyUpdate:
         assert self._step is not None
         means = torch.stack(results).mean(0).tolist()
         metrics = dict(zip(self._step.names, means, strict=True))
-        return metrics | {"epochs": float(epoch), "learning_rate": float(self.optimizer.param_groups[0]["lr"])}
+        return metrics | {
+            "epochs": float(epoch),
+            "learning_rate": float(self.optimizer.param_groups[0]["lr"]),
+        }
 
     @property
     def compile_seconds(self) -> float:

@@ -25,7 +25,9 @@ def parameters(optimizer: Optimizer) -> list[Tensor]:
     return [p for group in optimizer.param_groups for p in group["params"]]
 
 
-def functional(optimizer: Optimizer, fused: bool) -> tuple[Apply, Callable[[], None]] | None:
+def functional(
+    optimizer: Optimizer, fused: bool, params: list[Tensor] | None = None
+) -> tuple[Apply, Callable[[], None]] | None:
     """``(apply, read_learning_rates)`` for Adam, AdamW, SGD and RMSprop, or None for any other optimizer.
 
     ``apply(grads)`` takes one gradient a parameter, in the order of :func:`parameters`, and can be traced.
@@ -35,11 +37,16 @@ def functional(optimizer: Optimizer, fused: bool) -> tuple[Apply, Callable[[], N
     Args:
         optimizer: of exactly one of the classes above.
         fused: use the fused kernel, which is fastest where nothing is compiled.
+        params: step on these alone, in the order of :func:`parameters`; None: all.
     """
     make = {Adam: _adam, AdamW: _adam, SGD: _sgd, RMSprop: _rmsprop}.get(type(optimizer))
     if make is None or any(group.get("capturable") or group.get("differentiable") for group in optimizer.param_groups):
         return None
-    groups = optimizer.param_groups
+    kept = {id(p) for p in (parameters(optimizer) if params is None else params)}
+    groups = [{**g, "params": [p for p in g["params"] if id(p) in kept]} for g in optimizer.param_groups]
+    sources, groups = zip(
+        *[(s, g) for s, g in zip(optimizer.param_groups, groups, strict=True) if g["params"]], strict=True
+    )
     rates = [torch.as_tensor(g["lr"], dtype=g["params"][0].dtype, device=g["params"][0].device) for g in groups]
     rates = [rate.clone() for rate in rates]
     applies = [make(optimizer, group, rate, fused) for group, rate in zip(groups, rates, strict=True)]
@@ -52,7 +59,7 @@ def functional(optimizer: Optimizer, fused: bool) -> tuple[Apply, Callable[[], N
             start += size
 
     def read_learning_rates() -> None:
-        for group, rate in zip(groups, rates, strict=True):
+        for group, rate in zip(sources, rates, strict=True):
             rate.fill_(group["lr"])
 
     return apply, read_learning_rates

@@ -6,7 +6,7 @@ import shutil
 import time
 import types
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from logging import getLogger
 from typing import Any
 
@@ -18,6 +18,10 @@ from torch.optim import Optimizer
 from pgkit.updates import optimizers
 
 _log = getLogger("pgkit")
+
+
+def _rows(data: TensorDictBase, index: Tensor) -> TensorDictBase:
+    return data[index]
 
 
 class GradientStep:
@@ -35,6 +39,9 @@ class GradientStep:
         max_grad_norm: bound of the gradient's norm over all parameters; None: no bound.
         before: applied to the minibatch first.
         after: called last, without gradients (target networks).
+        gather: ``(data, index) -> minibatch``; by default ``data[index]``.
+        write_back: called with ``(data, index, minibatch)`` after the loss, without gradients (priorities).
+        only: the ``loss_*`` entries to step on and the parameters each trains; the others stay. None: all.
         compile: compile the step.
     """
 
@@ -47,6 +54,9 @@ class GradientStep:
         max_grad_norm: float | None = None,
         before: Callable[[TensorDictBase], TensorDictBase] | None = None,
         after: Callable[[], None] | None = None,
+        gather: Callable[[TensorDictBase, Tensor], TensorDictBase] = _rows,
+        write_back: Callable[[TensorDictBase, Tensor, TensorDictBase], None] | None = None,
+        only: Mapping[str, Sequence[Tensor]] | None = None,
         compile: bool = False,
     ) -> None:
         self.optimizer = optimizer
@@ -54,16 +64,23 @@ class GradientStep:
         self.compile_seconds = 0.0
         self._seen: set[Any] = set()
         params = optimizers.parameters(optimizer)
-        functional = optimizers.functional(optimizer, fused=not compile)
+        if only is not None:
+            kept = {id(p) for reached in only.values() for p in reached}
+            params = [p for p in params if id(p) in kept]
+        functional = optimizers.functional(optimizer, fused=not compile, params=params)
         apply, self._read_learning_rates = functional or (None, lambda: None)
         self._in_graph = apply is not None
 
         def step(data: TensorDictBase, index: Tensor) -> tuple[Tensor, list[Tensor]]:
-            batch = data[index]
-            out = loss(batch if before is None else before(batch))
-            total = torch.stack([value.sum() for key, value in out.items() if key.startswith("loss_")]).sum()
+            batch = gather(data, index)
+            batch = batch if before is None else before(batch)
+            out = loss(batch)
+            terms = [key for key in out.keys() if key.startswith("loss_") and (only is None or key in only)]
+            total = torch.stack([out[key].sum() for key in terms]).sum()
             grads = list(torch.autograd.grad(total, params, allow_unused=True, materialize_grads=True))
             with torch.no_grad():
+                if write_back is not None:
+                    write_back(data, index, batch)
                 norm = torch.stack([grad.square().sum() for grad in grads]).sum().sqrt()
                 if max_grad_norm is not None:
                     factor = (max_grad_norm / (norm + 1e-6)).clamp(max=1.0)
@@ -112,6 +129,7 @@ class GradientStep:
         return metrics
 
     def _optimizer_step(self, grads: list[Tensor]) -> None:
+        self.optimizer.zero_grad(set_to_none=True)
         for param, grad in zip(self._params, grads, strict=True):
             param.grad = grad
         self.optimizer.step()

@@ -24,7 +24,7 @@ def read_keys(loss: nn.Module, data: TensorDictBase) -> list[Any]:
     if hasattr(loss, "tensor_keys"):
         configured = [getattr(loss.tensor_keys, field.name) for field in fields(loss.tensor_keys)]
         keys += [key for key in configured if isinstance(key, str | tuple)]
-        if loss.tensor_keys.advantage in present:
+        if getattr(loss.tensor_keys, "advantage", None) in present:
             keys = [key for key in keys if not (isinstance(key, tuple) and key[0] == "next")]
     keys += [key for key in (("collector", "mask"),) if key in present]
     return [key for key in dict.fromkeys(keys) if key in present]
@@ -60,7 +60,10 @@ def check(loss: nn.Module, advantage: Any, optimizer: Optimizer, batch: TensorDi
 
 
 def _one_owner(what: str, loss: nn.Module, advantage: Any) -> None:
-    mine, theirs = getattr(getattr(loss, "_value_estimator", None), what, None), getattr(advantage, what, None)
+    mine, theirs = (
+        getattr(getattr(loss, "_value_estimator", None), what, None),
+        getattr(advantage, what, None),
+    )
     if mine is not None and theirs is not None and float(mine) != float(theirs):
         raise UserError(
             f"two owners of {what}: {type(advantage).__name__} has {float(theirs):g}, the value estimator inside "

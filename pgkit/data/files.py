@@ -1,0 +1,79 @@
+"""A replay buffer's state, as a dict and as a file of its own."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from pgkit.errors import UserError
+
+if TYPE_CHECKING:
+    from pgkit.data.replay import ReplayBuffer
+
+
+def state(buffer: ReplayBuffer) -> dict[str, Any]:
+    """The rows in use, the counters and the generator."""
+    frames, finals = min(buffer.written + buffer.columns, buffer.rows), min(buffer.finals, buffer.final_rows)
+    return {
+        "made_for": _made_for(buffer),
+        "counters": (buffer.written, buffer.start, buffer.finals),
+        "owner": buffer.owner[:finals].clone(),
+        "generator": buffer.generator.get_state(),
+        "frames": {key: x[:frames].clone() for key, x in buffer.frames.items()},
+        "observations": {key: x[:frames].clone() for key, x in buffer.observations.items(True, True)},
+        "finals": {key: x[buffer.rows :][:finals].clone() for key, x in buffer.observations.items(True, True)},
+        "sampler": None if buffer.sampler is None else buffer.sampler.state_dict(),
+    }
+
+
+def restore(buffer: ReplayBuffer, saved: dict[str, Any]) -> None:
+    """Loads :func:`state` into a buffer made alike."""
+    theirs, mine = saved["made_for"], _made_for(buffer)
+    for name, value in mine.items():
+        if theirs.get(name) != value:
+            raise UserError(
+                f"the saved replay buffer is another one: its {name} is {theirs.get(name)}, here it is {value}; give the "
+                "same environment and settings, or train without the saved buffer"
+            )
+    buffer.written, buffer.start, buffer.finals = saved["counters"]
+    buffer.owner[: len(saved["owner"])] = saved["owner"]
+    buffer.generator.set_state(saved["generator"])
+    for key, x in saved["frames"].items():
+        buffer.frames.get(key)[: len(x)] = x
+    for key, x in saved["observations"].items():
+        buffer.observations.get(key)[: len(x)] = x
+    for key, x in saved["finals"].items():
+        buffer.observations.get(key)[buffer.rows : buffer.rows + len(x)] = x
+    if buffer.sampler is not None:
+        buffer.sampler.load_state_dict(saved["sampler"])
+
+
+def save(buffer: ReplayBuffer, path: Path) -> None:
+    """Writes the state to ``path``: a crash leaves the old file or the new one."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(path.name + ".tmp")
+    torch.save(state(buffer), temporary)
+    os.replace(temporary, path)
+
+
+def load(buffer: ReplayBuffer, path: Path) -> None:
+    """Reads what :func:`save` wrote."""
+    if not path.is_file():
+        raise UserError(f"there is no saved replay buffer at {path}")
+    restore(buffer, torch.load(path, weights_only=True))
+
+
+def _made_for(buffer: ReplayBuffer) -> dict[str, Any]:
+    shapes = {str(key): tuple(x.shape[1:]) for key, x in buffer.observations.items(True, True)}
+    return {
+        "environment": buffer.env_name,
+        "observation": shapes,
+        "action": tuple(buffer.frames.get("action").shape[1:]),
+        "num_envs": buffer.columns,
+        "capacity": buffer.capacity,
+        "final_rows": buffer.final_rows,
+        "prioritized": buffer.sampler is not None,
+    }

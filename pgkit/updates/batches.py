@@ -1,0 +1,97 @@
+"""Where an off-policy update's batches come from: pgkit's replay, or any of TorchRL's."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, Protocol
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+
+from pgkit.data import ReplayBuffer
+from pgkit.updates import wiring
+
+Draw = tuple[TensorDictBase, Tensor]
+
+
+class Batches(Protocol):
+    """A source of batches for :class:`~pgkit.updates.GradientStep`."""
+
+    def extend(self, rollout: TensorDictBase) -> None:
+        """Stores a rollout."""
+        ...
+
+    def draw(self, batches: int) -> Iterator[Draw]:
+        """Pairs ``(data, index)``, one a gradient step."""
+        ...
+
+    def gather(self, data: TensorDictBase, index: Tensor) -> TensorDictBase:
+        """The batch of a pair, in the graph."""
+        ...
+
+    def write_back(self, data: TensorDictBase, index: Tensor, batch: TensorDictBase) -> None:
+        """The batch's priorities to where they belong, in the graph."""
+        ...
+
+    def drawn(self) -> None:
+        """Called after each step, outside the graph."""
+        ...
+
+
+class OwnBatches:
+    """From pgkit's replay: only row numbers are drawn, the rest is in the graph."""
+
+    def __init__(self, buffer: ReplayBuffer, loss: nn.Module, batch_size: int) -> None:
+        self.buffer, self.batch_size = buffer, batch_size
+        self.extend, self.write_back = buffer.extend, buffer.write_back
+        self.gather = buffer.gather(discount(loss) if buffer.n_steps > 1 else 1.0)
+
+    def draw(self, batches: int) -> Iterator[Draw]:
+        at_once = 1 if self.buffer.sampler is not None else max(batches, 1)  # priorities change with every step
+        for first in range(0, batches, at_once):
+            for index in self.buffer.sample_index(self.batch_size, min(at_once, batches - first)):
+                yield self.buffer.data, index
+
+    def drawn(self) -> None:
+        pass
+
+
+class TorchRLBatches:
+    """From a TorchRL replay buffer: its ``sample()`` is called for every step, ``td_error`` is written back to it."""
+
+    def __init__(self, buffer: Any, loss: nn.Module, batch_size: int) -> None:
+        self.buffer, self.loss, self.batch_size = buffer, loss, batch_size
+        self.priority = getattr(loss.tensor_keys, "priority", "td_error")
+        self.prioritized = (
+            hasattr(getattr(buffer, "sampler", None), "update_priority")
+            and "Prioritized" in type(buffer.sampler).__name__
+        )
+        self._index = torch.arange(batch_size)
+
+    def extend(self, rollout: TensorDictBase) -> None:
+        self.buffer.extend(rollout.reshape(-1))
+
+    def draw(self, batches: int) -> Iterator[Draw]:
+        for _ in range(batches):
+            self._sample = self.buffer.sample(self.batch_size)
+            data = self._sample.select(*wiring.read_keys(self.loss, self._sample))
+            self._batch = data.set(self.priority, torch.zeros(self.batch_size))
+            yield self._batch, self._index
+
+    def gather(self, data: TensorDictBase, index: Tensor) -> TensorDictBase:
+        return data.exclude(self.priority)
+
+    def write_back(self, data: TensorDictBase, index: Tensor, batch: TensorDictBase) -> None:
+        if self.prioritized:
+            data[self.priority].copy_(batch[self.priority])
+
+    def drawn(self) -> None:
+        if self.prioritized:
+            self.buffer.update_tensordict_priority(self._sample.set(self.priority, self._batch[self.priority]))
+
+
+def discount(loss: nn.Module) -> Any:
+    """The discount of a loss: its own ``gamma``, or its value estimator's."""
+    gamma = getattr(loss, "gamma", None)
+    return loss.value_estimator.gamma if gamma is None else gamma
