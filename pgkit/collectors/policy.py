@@ -11,6 +11,7 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torch.fx.experimental.proxy_tensor import make_fx
+from torchrl.data import TensorSpec
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 Act = Callable[[Tensor], tuple[Tensor, ...]]
@@ -41,8 +42,20 @@ def trace(actor: TensorDictModuleBase, obs: Tensor) -> Act:
 
     with torch.no_grad(), torch.random.fork_rng(devices=[]), set_exploration_type(ExplorationType.RANDOM):
         try:
-            return make_fx(act)(obs).forward
+            # TorchRL's TanhNormal tests its bounds in Python unless it is being compiled, which is what this is
+            with torch.compiler._compile_session_context():
+                return make_fx(act)(obs).forward
         except RuntimeError as error:
             if "proxy" not in str(error) and "trac" not in str(error):
                 raise
             return act
+
+
+def random_actions(spec: TensorSpec, outputs: dict[NestedKey, Tensor]) -> Act:
+    """A policy that draws actions uniformly from ``spec``; its other outputs, shaped as ``outputs``, are NaN."""
+    others = {key: torch.full_like(x, torch.nan) for key, x in outputs.items() if key != "action"}
+
+    def act(obs: Tensor) -> tuple[Tensor, ...]:
+        return tuple(spec.rand() if key == "action" else others[key] for key in outputs)
+
+    return act

@@ -49,7 +49,7 @@ def fill(arrays: Arrays, envs: ArrayEnv, act: Act, keys: Sequence[NestedKey], nu
     policy_input = torch.from_numpy(padded)
     if (envs.step_count == 0).all():
         envs.reset()
-    torch.manual_seed(seed)
+    torch.default_generator.manual_seed(seed)  # torch.manual_seed costs 0.3 ms
     for t in range(len(obs)):
         if padded is not envs.obs:
             padded[rows] = envs.obs

@@ -10,7 +10,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from pgkit.collectors.policy import Act, output_keys, trace
+from pgkit.collectors.policy import Act, output_keys, random_actions, trace
 from pgkit.collectors.stepping import allocate, fill
 from pgkit.collectors.workers import Workers
 from pgkit.envs import VectorEnv
@@ -34,13 +34,21 @@ class VectorCollector:
             read before every rollout.
         frames_per_batch: frames of a rollout, a multiple of ``env.num_envs``.
         total_frames: frames after which iteration stops (with the rollout that reaches them); -1: never.
+        init_random_frames: the rollouts that begin before so many frames draw actions uniformly from the action spec;
+            their log-probability is NaN.
 
     Raises:
         UserError: sizes that do not fit, or an actor that was built for another environment.
     """
 
     def __init__(
-        self, env: VectorEnv, actor: TensorDictModuleBase, *, frames_per_batch: int, total_frames: int = -1
+        self,
+        env: VectorEnv,
+        actor: TensorDictModuleBase,
+        *,
+        frames_per_batch: int,
+        total_frames: int = -1,
+        init_random_frames: int = 0,
     ) -> None:
         if frames_per_batch < 1 or frames_per_batch % env.num_envs:
             raise UserError(
@@ -54,6 +62,7 @@ class VectorCollector:
             )
         self.env, self.actor = env, actor
         self.frames_per_batch, self.total_frames = frames_per_batch, total_frames
+        self.init_random_frames = init_random_frames
         self.frames = self._rollouts = 0
         self._steps = frames_per_batch // env.num_envs
         self._keys = output_keys(actor)
@@ -61,6 +70,8 @@ class VectorCollector:
         self._workers: Workers | None = None
         self._act: Act | None = None
         self._traced: list[int] = []
+        stores = [store for module in actor.modules() for store in (module._parameters, module._buffers)]
+        self._tensors = [(store, name) for store in stores for name, x in store.items() if x is not None]
 
     def __iter__(self) -> Iterator[TensorDictBase]:
         while self.total_frames < 0 or self.frames < self.total_frames:
@@ -69,13 +80,15 @@ class VectorCollector:
     def rollout(self) -> TensorDictBase:
         """Collects one rollout with the actor's present weights."""
         seed = episode_seed(self.env.seed, -1 % 2**32, self._rollouts)
+        random = self.frames < self.init_random_frames
         if self.env.workers > 1:
-            arrays = self._pool().collect(self.actor, seed)
+            arrays = self._pool().collect(self.actor, seed, random)
         else:
             obs = self.env.arrays.obs
             arrays = allocate(self._steps, obs, self._outputs)
+            act = random_actions(self.env.action_spec, self._outputs) if random else self._policy()
             with torch.random.fork_rng(devices=[]):
-                fill(arrays, self.env.arrays, self._policy(), self._keys, self.env.num_envs, seed)
+                fill(arrays, self.env.arrays, act, self._keys, self.env.num_envs, seed)
         self.frames += self.frames_per_batch
         self._rollouts += 1
         tensors = {key: torch.from_numpy(array).transpose(0, 1) for key, array in arrays.items()}
@@ -110,7 +123,7 @@ class VectorCollector:
 
     def _policy(self) -> Act:
         """The traced actor, traced again if its tensors are other ones than before (moved, or replaced)."""
-        tensors = [x.data_ptr() for x in (*self.actor.parameters(), *self.actor.buffers())]
+        tensors = [store[name].data_ptr() for store, name in self._tensors]
         if self._act is None or tensors != self._traced:
             self._act, self._traced = trace(self.actor, torch.from_numpy(self.env.arrays.obs)), tensors
         return self._act

@@ -16,8 +16,9 @@ import torch.multiprocessing as mp
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
+from torchrl.data import TensorSpec
 
-from pgkit.collectors.policy import output_keys, trace
+from pgkit.collectors.policy import output_keys, random_actions, trace
 from pgkit.collectors.stepping import Arrays, allocate, fill
 from pgkit.envs import ArrayEnv, VectorEnv
 
@@ -42,7 +43,7 @@ class Workers:
         for first, end in pairwise(bounds):
             ours, theirs = context.Pipe()
             make_env = cloudpickle.dumps(env.make_env)
-            args = (theirs, make_env, first, end - first, env.num_envs, env.seed, self._actor, shared)
+            args = (theirs, make_env, first, end - first, env.num_envs, env.seed, self._actor, shared, env.action_spec, outputs)
             process = context.Process(target=_serve, args=args, daemon=True)
             process.start()
             theirs.close()
@@ -52,12 +53,12 @@ class Workers:
         self.close = weakref.finalize(self, _stop, self._pipes, processes)
         self._ask([None] * env.workers)  # the processes are up
 
-    def collect(self, actor: TensorDictModuleBase, seed: int) -> Arrays:
+    def collect(self, actor: TensorDictModuleBase, seed: int, random: bool = False) -> Arrays:
         """Collects one rollout with the actor's present weights; arrays ``[T, N, ...]``, the caller's to keep."""
         with torch.no_grad():
             for mine, theirs in zip(self._actor.state_dict().values(), actor.state_dict().values(), strict=True):
                 mine.copy_(theirs)
-        self._ask([("collect", seed)] * len(self._pipes))
+        self._ask([("collect", (seed, random))] * len(self._pipes))
         return {key: array.copy() for key, array in self._arrays.items()}
 
     def state_dict(self) -> dict[str, Any]:
@@ -100,6 +101,8 @@ def _serve(
     seed: int,
     actor: TensorDictModuleBase,
     shared: dict[NestedKey, Tensor],
+    spec: TensorSpec,
+    outputs: dict[NestedKey, Tensor],
 ) -> None:
     """A worker's life: answers ``(answer, failure)`` to every request until the pipe closes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
@@ -113,7 +116,9 @@ def _serve(
             request, argument = pipe.recv()
             answer = None
             if request == "collect":
-                fill(arrays, envs, act, output_keys(actor), num_envs, argument)
+                seed_of_rollout, random = argument
+                policy = random_actions(spec, outputs) if random else act
+                fill(arrays, envs, policy, output_keys(actor), num_envs, seed_of_rollout)
             elif request == "state":
                 answer = envs.state_dict()
             else:
