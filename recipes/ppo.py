@@ -71,7 +71,7 @@ PRESETS = {
         normalize_obs=False, scale_returns=False, critic_coeff=0.5,
     ),
     "Pendulum-*": dict(
-        total_frames=200_000, eval_every=50_000, num_envs=4, steps=1024, learning_rate=1e-3, gamma=0.9,
+        total_frames=200_000, eval_every=50_000, steps=128, learning_rate=1e-3, gamma=0.95, log_std=0.0,
         normalize_advantage="minibatch",
     ),
     "HalfCheetah-*": dict(lmbda=0.9),
