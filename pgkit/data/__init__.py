@@ -1,6 +1,7 @@
 """Replay: uniform, prioritized, n-step, on TorchRL's storages."""
 
+from pgkit.data.files import BesideCheckpoint
 from pgkit.data.prioritized import Prioritized
 from pgkit.data.replay import ReplayBuffer
 
-__all__ = ["Prioritized", "ReplayBuffer"]
+__all__ = ["BesideCheckpoint", "Prioritized", "ReplayBuffer"]

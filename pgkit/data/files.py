@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from logging import getLogger
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +13,8 @@ from pgkit.errors import UserError
 
 if TYPE_CHECKING:
     from pgkit.data.replay import ReplayBuffer
+
+_log = getLogger("pgkit")
 
 
 def state(buffer: ReplayBuffer) -> dict[str, Any]:
@@ -77,3 +80,35 @@ def _made_for(buffer: ReplayBuffer) -> dict[str, Any]:
         "final_rows": buffer.final_rows,
         "prioritized": buffer.sampler is not None,
     }
+
+
+class BesideCheckpoint:
+    """A run's handle on its replay buffer: a checkpoint has its frame count, a file beside it the frames.
+
+    Args:
+        buffer: the replay buffer.
+        path: its file.
+        save: write that file with every checkpoint; otherwise a resumed run fills an empty buffer first, and says so.
+    """
+
+    def __init__(self, buffer: ReplayBuffer, path: Path, save: bool) -> None:
+        self.buffer, self.path, self.save = buffer, path, save
+
+    def state_dict(self) -> dict[str, Any]:
+        """The number of frames; writes the file."""
+        if self.save:
+            save(self.buffer, self.path)
+        return {"written": self.buffer.written, "saved": self.save, "generator": self.buffer.generator.get_state()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Reads the file that belongs to the checkpoint, if there is one."""
+        if state["saved"] and self.path.is_file():
+            load(self.buffer, self.path)
+            if self.buffer.written == state["written"]:
+                return
+            self.buffer.clear()
+        self.buffer.generator.set_state(state["generator"])
+        _log.warning(
+            "resumed without the replay buffer (%s): it fills again before training goes on; --save-buffer keeps it",
+            "its file is of another checkpoint" if state["saved"] else "it was not saved",
+        )

@@ -167,6 +167,13 @@ class ReplayBuffer:
         """``(data, index) -> batch`` of :attr:`data`, a function of tensors that can be compiled."""
         return partial(gather, rows=self.rows, n_steps=self.n_steps, gamma=gamma)
 
+    def clear(self) -> None:
+        """Forgets every frame."""
+        if self.sampler is not None:
+            self.sampler.extend(torch.arange(0), torch.arange(self.rows))
+        self.written = self.start = self.finals = 0
+        self.owner.fill_(-1)
+
     def state_dict(self) -> dict[str, Any]:
         """Everything stored, and the state of the draws."""
         return files.state(self)

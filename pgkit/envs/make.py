@@ -10,12 +10,19 @@ from typing import Any
 
 import gymnasium as gym
 
+from pgkit.envs.action_repeat import ActionRepeat
 from pgkit.envs.vector import VectorEnv
 from pgkit.errors import UserError
 
 
 def make(
-    env_id: str | Callable[[], gym.Env], num_envs: int = 1, *, seed: int = 0, workers: int = 1, **kwargs: Any
+    env_id: str | Callable[[], gym.Env],
+    num_envs: int = 1,
+    *,
+    seed: int = 0,
+    workers: int = 1,
+    action_repeat: int = 1,
+    **kwargs: Any,
 ) -> VectorEnv:
     """Makes a vector of environments.
 
@@ -25,6 +32,7 @@ def make(
         num_envs: number of environments.
         seed: seed of the whole vector; environment ``i`` gets its own stream.
         workers: processes that share the environments when a :class:`~pgkit.collectors.VectorCollector` collects.
+        action_repeat: steps of the simulator for each action; a frame is then one decision, its reward their sum.
         **kwargs: passed to ``gymnasium.make``, or to the dm_control task.
 
     Raises:
@@ -37,7 +45,17 @@ def make(
             "choose 1 <= workers <= num_envs"
         )
     make_env = partial(make_one, env_id, **kwargs) if isinstance(env_id, str) else env_id
-    return VectorEnv(make_env, num_envs, seed, workers)
+    if action_repeat > 1:
+        make_env = partial(_repeat, make_env, action_repeat)
+    env = VectorEnv(make_env, num_envs, seed, workers)
+    env.env_id = env_id if isinstance(env_id, str) else getattr(env_id, "__qualname__", type(env_id).__name__)
+    if action_repeat > 1:
+        env.env_id += f" (action repeat {action_repeat})"
+    return env
+
+
+def _repeat(make_env: Callable[[], gym.Env], times: int) -> gym.Env:
+    return ActionRepeat(make_env(), times)
 
 
 def make_one(env_id: str, **kwargs: Any) -> gym.Env:

@@ -20,6 +20,8 @@ from pgkit.envs.arrays import ArrayEnv, observation_shape
 class VectorEnv(EnvBase):
     """``num_envs`` environments with batch size ``[num_envs]`` and TorchRL's specs and keys.
 
+    ``env_id`` names what it is made of, where :func:`~pgkit.envs.make` made it.
+
     TorchRL's collectors step it through TensorDicts; :class:`pgkit.collectors.VectorCollector` uses
     :attr:`arrays`, the numpy side, or gives each of ``workers`` processes its share of the environments.
 
@@ -29,6 +31,8 @@ class VectorEnv(EnvBase):
         seed: every episode's seed is derived from it.
         workers: processes that collect with this environment (1: the calling process).
     """
+
+    env_id: str = "unnamed environment"
 
     def __init__(self, make_env: Callable[[], gym.Env], num_envs: int = 1, seed: int = 0, workers: int = 1) -> None:
         super().__init__(device=None, batch_size=torch.Size([num_envs]))
