@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import shutil
 import time
 import types
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from logging import getLogger
 from typing import Any
 
 import torch
@@ -16,8 +14,6 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from pgkit.updates import optimizers
-
-_log = getLogger("pgkit")
 
 
 def _rows(data: TensorDictBase, index: Tensor) -> TensorDictBase:
@@ -113,7 +109,7 @@ class GradientStep:
         else:
             start = time.perf_counter()
             with torch._dynamo.config.patch(trace_autograd_ops=True), warnings.catch_warnings():
-                warnings.simplefilter("ignore", FutureWarning)  # tensordict reads a retired dynamo setting
+                warnings.simplefilter("ignore")  # dynamo on tensordict's and TorchRL's code, nothing of the user's
                 metrics, grads = self._compiled(data, index)
             self.compile_seconds += time.perf_counter() - start
             self._seen.add(signature)
@@ -141,19 +137,3 @@ class GradientStep:
 def _compile(function: Callable[..., Any]) -> Callable[..., Any]:
     # fallback_random: the same random numbers as eager code
     return torch.compile(function, fullgraph=True, dynamic=False, options={"fallback_random": True})
-
-
-def worth_compiling(compile: str, steps: float | None) -> bool:
-    """Whether to compile, by the user's choice ``auto``, ``on`` or ``off``.
-
-    ``auto`` compiles where there is a C++ compiler and at least 30,000 steps are expected (or their number is not
-    known): a compilation costs 20 to 40 seconds and saves about one millisecond a step.
-    """
-    if compile not in ("auto", "on", "off"):
-        raise ValueError(f"compile is 'auto', 'on' or 'off', not {compile!r}")
-    if compile != "auto":
-        return compile == "on"
-    if shutil.which("g++") is None and shutil.which("clang++") is None:
-        _log.warning("no C++ compiler (g++) found: the update runs without torch.compile, about 3 times slower")
-        return False
-    return steps is None or steps >= 30_000

@@ -28,6 +28,30 @@ class Options(contest.Options):
     warmup: int = RANDOM_FRAMES + 1000
 
 
+def pgkit(seed: int) -> Iterator[int]:
+    """pgkit through its public API, one frame and one update in turn."""
+    from pgkit import collectors, data, envs, losses, modules, updates
+
+    torch.manual_seed(seed)
+    env = envs.make(ENV_ID, seed=seed)
+    actor, critics = modules.tanh_normal_actor(env, (WIDTH, WIDTH)), modules.q_value(env, 2, (WIDTH, WIDTH))
+    loss = losses.SACLoss(actor, critics, gamma=0.99)
+    update = updates.OffPolicyUpdate(
+        loss,
+        data.ReplayBuffer(env, BUFFER),
+        torch.optim.Adam(loss.parameters(), lr=3e-4),
+        batch_size=BATCH,
+        learning_starts=RANDOM_FRAMES,
+        tau=0.005,
+        compile="on",
+    )
+    collector = collectors.VectorCollector(env, actor, frames_per_batch=1, init_random_frames=RANDOM_FRAMES)
+    for rollout in collector:
+        update(rollout)
+        if collector.frames % CHUNK == 0:
+            yield collector.frames
+
+
 def sb3(seed: int) -> Iterator[int]:
     """Stable-Baselines3."""
     from stable_baselines3 import SAC
@@ -117,6 +141,7 @@ def floor(threads: int) -> tuple[float, float]:
 
 
 CONTENDERS = {
+    "pgkit": contest.Contender(pgkit, "pgkit", "one frame, one update"),
     "sb3": contest.Contender(sb3, "stable_baselines3", "train_freq=1, gradient_steps=1"),
     "sbx": contest.Contender(sbx, "sbx", "train_freq=1, gradient_steps=1, JAX"),
     "torchrl": contest.Contender(

@@ -1,0 +1,174 @@
+"""The replay buffer against the rollouts it was filled from, frame by frame."""
+
+from functools import partial
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.data import LazyMemmapStorage
+
+from pgkit import collectors, data, envs, modules
+from pgkit.errors import UserError
+
+GAMMA = 0.9
+
+
+def rollouts(env, steps, count):
+    actor = modules.tanh_normal_actor(env, (8,))
+    collector = collectors.VectorCollector(env, actor, frames_per_batch=env.num_envs * steps)
+    return [collector.rollout() for _ in range(count)]
+
+
+def hand_made(observations, rewards, terminated=(), truncated=(), finals=None):
+    """One env's rollout [1, T]; ``observations`` has T + 1 numbers, ``finals`` the true next observation of a step."""
+    steps = len(rewards)
+    after = torch.tensor(observations[1:], dtype=torch.float32)
+    for t, value in (finals or {}).items():
+        after[t] = value
+    flag = lambda where: torch.tensor([[t in where] for t in range(steps)])  # noqa: E731
+    wide = lambda x: x.reshape(1, steps, 1).expand(1, steps, 3)  # noqa: E731
+    return TensorDict(
+        {
+            "observation": wide(torch.tensor(observations[:-1], dtype=torch.float32)),
+            "action": torch.zeros(1, steps, 1),
+            "next": {
+                "observation": wide(after),
+                "reward": torch.tensor(rewards, dtype=torch.float32).reshape(1, steps, 1),
+                "terminated": flag(terminated).unsqueeze(0),
+                "truncated": flag(truncated).unsqueeze(0),
+                "done": (flag(terminated) | flag(truncated)).unsqueeze(0),
+            },
+        },
+        [1, steps],
+    )
+
+
+def kept(buffer):
+    """All frames that can be sampled, oldest first."""
+    rows = torch.arange(buffer.start, buffer.start + len(buffer)) % buffer.rows
+    return buffer.gather(GAMMA)(buffer.data, rows)
+
+
+@pytest.mark.parametrize("num_envs", [1, 3])
+@pytest.mark.parametrize("steps", [1, 7, 60])
+@pytest.mark.parametrize("n_steps", [1, 3])
+def test_every_frame_kept_is_the_frame_written(num_envs, steps, n_steps):
+    env = envs.make("Pendulum-v1", num_envs)
+    buffer = data.ReplayBuffer(env, capacity=240, n_steps=n_steps)
+    history = rollouts(env, steps, 720 // steps)
+    for rollout in history:
+        buffer.extend(rollout)
+    whole = torch.cat(history, 1)
+    batch = kept(buffer)
+    assert 240 - (n_steps - 1) * num_envs == len(buffer) == len(batch)
+    for k, frame in enumerate(range(buffer.start, buffer.start + len(buffer))):
+        t, n = divmod(frame, num_envs)
+        assert torch.equal(batch["observation"][k], whole["observation"][n, t])
+        assert torch.equal(batch["action"][k], whole["action"][n, t])
+        total = 0.0
+        for m in range(n_steps):
+            total += GAMMA**m * whole["next", "reward"][n, t + m]
+            if whole["next", "done"][n, t + m]:
+                break
+        torch.testing.assert_close(batch["next", "reward"][k], total)
+        assert torch.equal(batch["next", "observation"][k], whole["next", "observation"][n, t + m])
+        assert batch["next", "done"][k] == whole["next", "done"][n, t + m]
+
+
+def test_n_steps_stop_at_a_truncation_and_at_a_termination():
+    # rewards 1..6; step 1 is truncated (true final observation 50), step 4 terminates (60); n = 3, gamma 0.9:
+    # t=0: 1 + 0.9*2 = 2.8, two steps, next 50, not terminated; t=1: 2, one step, next 50
+    # t=2: 3 + 0.9*4 + 0.81*5 = 10.65, three steps, next 60, terminated; t=3: 4 + 0.9*5 = 8.5, two steps, next 60, terminated
+    buffer = data.ReplayBuffer(envs.make("Pendulum-v1"), 100, n_steps=3)
+    rollout = hand_made([0, 1, 2, 3, 4, 5, 6], [1, 2, 3, 4, 5, 6], {4}, {1}, {1: 50.0, 4: 60.0})
+    buffer.extend(rollout)
+    batch = kept(buffer)
+    torch.testing.assert_close(batch["next", "reward"].squeeze(-1), torch.tensor([2.8, 2.0, 10.65, 8.5]))
+    assert batch["steps_to_next_obs"].squeeze(-1).tolist() == [2, 1, 3, 2]
+    assert batch["next", "observation"][:, 0].tolist() == [50, 50, 60, 60]
+    assert batch["next", "terminated"].squeeze(-1).tolist() == [False, False, True, True]
+    assert batch["next", "done"].squeeze(-1).tolist() == [True, True, True, True]
+
+
+def test_rollouts_that_do_not_continue_one_another_keep_their_next_observations():
+    buffer = data.ReplayBuffer(envs.make("Pendulum-v1"), 100)
+    buffer.extend(hand_made([0, 1, 2], [1, 1]))
+    buffer.extend(hand_made([7, 8, 9], [1, 1]))  # not from 2 on
+    batch = kept(buffer)
+    assert batch["observation"][:, 0].tolist() == [0, 1, 7, 8]
+    assert batch["next", "observation"][:, 0].tolist() == [1, 2, 8, 9]
+    assert not batch["next", "done"].any()
+
+
+def test_of_a_rollout_longer_than_the_capacity_the_end_is_kept():
+    buffer = data.ReplayBuffer(envs.make("Pendulum-v1"), 4)
+    for _ in range(2):
+        buffer.extend(hand_made(list(range(11)), list(range(10))))
+        assert kept(buffer)["next", "reward"].squeeze(-1).tolist() == [6, 7, 8, 9]
+        assert kept(buffer)["next", "observation"][:, 0].tolist() == [7, 8, 9, 10]
+
+
+def test_too_many_endings_evict_the_oldest_frames_and_none_is_wrong():
+    buffer = data.ReplayBuffer(envs.make("Pendulum-v1"), 64, final_rows=4)
+    for start in range(0, 60, 3):
+        buffer.extend(hand_made([start, start + 1, start + 2, 0], [1, 1, 1], {2}, finals={2: start + 0.5}))
+    batch = kept(buffer)
+    assert 0 < len(batch) < 60
+    ends = batch["next", "done"].squeeze(-1)
+    assert ends.sum() == 4
+    assert torch.equal(batch["next", "observation"][ends, 0], batch["observation"][ends, 0] - 1.5)
+
+
+def test_draws_are_uniform_over_all_frames_and_have_a_generator_of_their_own():
+    env = envs.make("Pendulum-v1")
+    one, other = (data.ReplayBuffer(env, 50, seed=3) for _ in range(2))
+    for rollout in rollouts(env, 20, 4):
+        one.extend(rollout)
+        other.extend(rollout)
+    torch.manual_seed(0)
+    drawn = one.sample_index(20, batches=500)
+    torch.manual_seed(1)
+    assert torch.equal(drawn, other.sample_index(20, batches=500))
+    counts = torch.bincount((drawn.flatten() - one.start) % one.rows, minlength=50)
+    assert len(counts) == 50 and counts.min() > 120 and counts.max() < 290  # 200 each, deviation 14
+
+
+def test_memmap_storage_gives_the_same_batches(tmp_path):
+    env = envs.make("Pendulum-v1")
+    here = data.ReplayBuffer(env, 50, seed=0)
+    there = data.ReplayBuffer(env, 50, seed=0, storage=partial(LazyMemmapStorage, scratch_dir=tmp_path))
+    for rollout in rollouts(env, 30, 3):
+        here.extend(rollout)
+        there.extend(rollout)
+    assert (here.sample(16) == there.sample(16)).all()
+
+
+@pytest.mark.parametrize("prioritized", [False, True])
+def test_saved_and_loaded_it_goes_on_bit_for_bit(tmp_path, prioritized):
+    env = envs.make("Pendulum-v1", 2)
+    make = lambda seed: data.ReplayBuffer(env, 60, sampler=data.Prioritized() if prioritized else None, seed=seed)  # noqa: E731
+    one, two = make(1), make(2)
+    *first, last = rollouts(env, 20, 4)
+    for rollout in first:
+        one.extend(rollout)
+    one.save(tmp_path / "buffer.pt")
+    two.load(tmp_path / "buffer.pt")
+    for buffer in (one, two):
+        buffer.extend(last)
+    assert (one.sample(16) == two.sample(16)).all()
+
+
+def test_refusals(tmp_path):
+    pendulum, cheetah, walker = (envs.make(name) for name in ("Pendulum-v1", "HalfCheetah-v5", "Walker2d-v5"))
+    buffer = data.ReplayBuffer(pendulum, 50)
+    with pytest.raises(UserError, match="batch_size=8 is above the 0 frames stored"):
+        buffer.sample(8)
+    with pytest.raises(UserError, match=r"made for 2 environments, the rollout's batch size is \(1, 2\)"):
+        data.ReplayBuffer(envs.make("Pendulum-v1", 2), 50).extend(hand_made([0, 1, 2], [1, 1]))
+    data.ReplayBuffer(cheetah, 50).save(tmp_path / "cheetah.pt")
+    with pytest.raises(UserError, match="its environment is HalfCheetah-v5, here it is Walker2d-v5"):
+        data.ReplayBuffer(walker, 50).load(tmp_path / "cheetah.pt")  # the shapes are the same
+    with pytest.raises(UserError, match="capacity"):
+        data.ReplayBuffer(pendulum, 0)
+    with pytest.raises(UserError, match="no saved replay buffer"):
+        buffer.load(tmp_path / "nothing.pt")

@@ -1,0 +1,183 @@
+"""SAC's loss: values by hand, agreement with TorchRL's, gradients, target entropy, refusals."""
+
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import nn
+from torchrl.modules import ProbabilisticActor, TanhNormal
+from torchrl.objectives import SACLoss as TorchRLSACLoss
+from torchrl.objectives import SoftUpdate
+
+from pgkit import controllers, envs, losses, modules
+from pgkit.errors import UserError
+
+
+def batch(size=32, obs=3, actions=1):
+    return TensorDict(
+        {
+            "observation": torch.randn(size, obs),
+            "action": torch.rand(size, actions) * 2 - 1,
+            "next": {
+                "observation": torch.randn(size, obs),
+                "reward": torch.randn(size, 1),
+                "done": torch.rand(size, 1) < 0.5,
+                "terminated": torch.rand(size, 1) < 0.3,
+            },
+        },
+        [size],
+    )
+
+
+class Fixed(nn.Module):
+    """loc 0, a free scale; the critics are linear: everything below can be done by hand."""
+
+    def __init__(self, scale):
+        super().__init__()
+        self.loc = nn.Parameter(torch.zeros(1, dtype=torch.float64))
+        self.register_buffer("scale", torch.tensor([scale], dtype=torch.float64))
+
+    def forward(self, observation):
+        return self.loc.expand(len(observation), 1), self.scale.expand(len(observation), 1)
+
+
+class Twins(nn.Module):
+    num_critics = 2
+
+    def __init__(self):
+        super().__init__()
+        self.weight = nn.Parameter(torch.tensor([2.0, 3.0], dtype=torch.float64))
+
+    def forward(self, observation, action):
+        return observation * self.weight + action
+
+
+def by_hand(scale=1e-6, **kwargs):
+    actor = ProbabilisticActor(
+        TensorDictModule(Fixed(scale), ["observation"], ["loc", "scale"]), in_keys=["loc", "scale"],
+        distribution_class=TanhNormal, distribution_kwargs={"event_dims": 1}, return_log_prob=True,
+    )  # fmt: skip
+    critics = TensorDictModule(Twins(), ["observation", "action"], ["state_action_value"])
+    loss = losses.SACLoss(actor, critics, gamma=0.5, **kwargs)
+    SoftUpdate(loss, tau=0.1)
+    number = lambda *x: torch.tensor(x, dtype=torch.float64).unsqueeze(-1)  # noqa: E731
+    data = TensorDict(
+        {
+            "observation": number(1, 1, 1),
+            "action": number(0.5, 0.5, 0.5),
+            "next": {
+                "observation": number(2, 2, 2),
+                "reward": number(1, 1, 1),
+                "terminated": torch.tensor([[False], [False], [True]]),
+                "done": torch.tensor([[False], [True], [True]]),
+            },
+        },
+        [3],
+    )
+    return loss, data
+
+
+def test_values_by_hand():
+    # scale -> 0, alpha 0: a' = 0, min Q'(2, 0) = 4; y = 1 + 0.5 * 4 = 3 (also where truncated), 1 where terminated
+    # Q(1, 0.5) = 2.5, 3.5: errors -0.5, 0.5 | -0.5, 0.5 | 1.5, 2.5 -> squares 0.5, 0.5, 8.5: mean 9.5 / 3
+    # actor: -min Q(1, 0) = -2
+    loss, data = by_hand(temperature=controllers.FixedTemperature(0.0))
+    out = loss(data)
+    assert out["loss_qvalue"].item() == pytest.approx(9.5 / 3, abs=1e-5)
+    assert out["loss_actor"].item() == pytest.approx(-2.0, abs=1e-5)
+    torch.testing.assert_close(data["td_error"], torch.tensor([0.5, 0.5, 2.5], dtype=torch.float64), atol=1e-5, rtol=0)
+
+
+def test_entropy_enters_target_actor_and_temperature_with_the_right_sign():
+    # scale 1e-6 and u = scale * e near 0: log pi = -e²/2 - log(1e-6) - log(sqrt(2 pi)), about 12.4: its weight is alpha
+    log_prob = -math.log(1e-6) - 0.5 * math.log(2 * math.pi)
+    torch.manual_seed(0)
+    loss, data = by_hand(alpha_init=0.1, target_entropy=-1.0)
+    out = loss(data)
+    log_prob = -out["entropy"].item()
+    assert 8 < log_prob < 12.9
+    assert out["loss_actor"].item() == pytest.approx(0.1 * log_prob - 2.0, abs=1e-4)
+    # loss_alpha = -log(0.1) * (log_prob - 1)
+    assert out["loss_alpha"].item() == pytest.approx(-math.log(0.1) * (log_prob - 1), abs=1e-4)
+    # y falls by gamma * alpha * log pi where not terminated: the error of the first row rises from -0.5 by about 0.6
+    assert data["td_error"][0] > 0.9 and data["td_error"][2].item() == pytest.approx(2.5, abs=1e-5)
+
+
+@pytest.mark.parametrize("distance", ["l2", "smooth_l1"])
+def test_agrees_with_torchrl(distance):
+    env = envs.make("HalfCheetah-v5")
+    actor = modules.tanh_normal_actor(env, (16,))
+    critics = [modules.q_value(env, 1, (16,)) for _ in range(2)]
+    theirs = TorchRLSACLoss(actor, critics, loss_function=distance, target_entropy=-6.0, alpha_init=0.3)
+    theirs.make_value_estimator(gamma=0.97)
+    mine = losses.SACLoss(actor, critics, loss_function=distance, alpha_init=0.3, gamma=0.97)
+    for loss in (mine, theirs):
+        SoftUpdate(loss, tau=0.1)
+    for ours, other in zip(
+        mine.target_qvalue_network_params.values(True, True), theirs.target_qvalue_network_params.values(True, True), strict=True
+    ):
+        other.data.copy_(ours.data.add_(torch.randn_like(ours)))
+    data = batch(obs=17, actions=6)
+    results = []
+    for loss in (mine, theirs):
+        copy = data.copy()
+        torch.manual_seed(0)
+        out = loss(copy)
+        total = sum(out[key] for key in ("loss_actor", "loss_qvalue", "loss_alpha"))
+        params = [*actor.parameters(), *loss.qvalue_network_params.values(True, True), loss.log_alpha]
+        results.append((out, copy["td_error"], torch.autograd.grad(total, params)))
+    (a, a_error, a_grads), (b, b_error, b_grads) = results
+    for key in ("loss_actor", "loss_qvalue", "loss_alpha", "alpha", "entropy"):
+        torch.testing.assert_close(a[key], b[key])
+    torch.testing.assert_close(a_error, b_error)
+    for x, y in zip(a_grads, b_grads, strict=True):
+        torch.testing.assert_close(x, y)
+
+
+def test_each_term_trains_its_own_parameters_and_an_ensemble_is_its_members():
+    env = envs.make("Pendulum-v1")
+    actor, critics = modules.tanh_normal_actor(env, (8,)), modules.q_value(env, hidden=(8,))
+    loss = losses.SACLoss(actor, critics)
+    SoftUpdate(loss, tau=0.1)
+    out = loss(batch())
+    groups = {"loss_actor": [*actor.parameters()], "loss_qvalue": [*critics.parameters()], "loss_alpha": [loss.log_alpha]}
+    for key, mine in groups.items():
+        for name, params in groups.items():
+            grads = torch.autograd.grad(out[key], params, allow_unused=True, retain_graph=True)
+            assert all((g is not None and g.any()) == (name == key) for g in grads) or key == name == "loss_actor"
+        assert mine
+
+
+@pytest.mark.parametrize(("name", "dimensions"), [("Pendulum-v1", 1), ("HalfCheetah-v5", 6), ("Humanoid-v5", 17)])
+def test_target_entropy_is_minus_the_number_of_action_dimensions(name, dimensions):
+    env = envs.make(name)
+    obs = env.observation_spec_unbatched["observation"].shape[0]
+    loss = losses.SACLoss(modules.tanh_normal_actor(env, (4,)), modules.q_value(env, hidden=(4,)))
+    SoftUpdate(loss, tau=0.1)
+    with pytest.raises(AttributeError):
+        _ = loss.target_entropy
+    loss(batch(4, obs, dimensions))
+    assert loss.target_entropy == -dimensions
+    known = losses.SACLoss(loss.actor_network, modules.q_value(env, hidden=(4,)), action_spec=env.action_spec_unbatched)
+    assert known.target_entropy == -dimensions
+
+
+def test_importance_weights_scale_the_critics_loss():
+    loss, data = by_hand(temperature=controllers.FixedTemperature(0.0))
+    out = loss(data.set("priority_weight", torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)))
+    assert out["loss_qvalue"].item() == pytest.approx(8.5 / 3, abs=1e-5)
+
+
+def test_gamma_has_one_owner_and_torchrl_s_way_of_setting_it_works():
+    loss, data = by_hand(temperature=controllers.FixedTemperature(0.0))
+    loss.make_value_estimator(gamma=0.25)  # y = 1 + 0.25 * 4 = 2: errors 0.5, 1.5 -> 2.5, 2.5, 8.5
+    assert loss(data)["loss_qvalue"].item() == pytest.approx(13.5 / 3, abs=1e-5)
+
+
+def test_a_discrete_actor_is_refused():
+    actor = modules.categorical_actor(envs.make("CartPole-v1"))
+    critics = modules.q_value(envs.make("Pendulum-v1"))
+    with pytest.raises(UserError, match=r"Categorical.*categorical_actor.*DiscreteSACLoss"):
+        losses.SACLoss(actor, critics)

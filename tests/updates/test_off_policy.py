@@ -1,0 +1,168 @@
+"""The off-policy update: eager equals compiled, targets, delay, priorities, TorchRL's parts, learning."""
+
+import copy
+
+import pytest
+import torch
+from torchrl.data import LazyTensorStorage, ReplayBuffer, TensorDictReplayBuffer
+from torchrl.objectives import SACLoss as TorchRLSACLoss
+
+from pgkit import collectors, controllers, data, envs, losses, modules, updates
+from pgkit.errors import UserError
+
+
+def agent(compile="off", *, seed=0, buffer=None, loss="pgkit", num_envs=1, optimizer=torch.optim.Adam, **kwargs):
+    torch.manual_seed(seed)
+    env = envs.make("Pendulum-v1", num_envs)
+    actor = modules.tanh_normal_actor(env, (16,))
+    if loss == "pgkit":
+        module = losses.SACLoss(actor, modules.q_value(env, hidden=(16,)), gamma=0.9)
+    else:
+        module = TorchRLSACLoss(actor, [modules.q_value(env, 1, (16,)) for _ in range(2)], target_entropy=-1.0)
+        module.make_value_estimator(gamma=0.9)
+    buffer = data.ReplayBuffer(env, 500, seed=0) if buffer is None else buffer(env)
+    settings = {"batch_size": 32, "learning_starts": 64, **kwargs}
+    update = updates.OffPolicyUpdate(module, buffer, optimizer(module.parameters(), lr=1e-2), compile=compile, **settings)
+    return update, collectors.VectorCollector(env, actor, frames_per_batch=32 * num_envs)
+
+
+def weights(update):
+    return torch.cat([x.detach().flatten().float() for x in update.loss.state_dict().values() if isinstance(x, torch.Tensor)])
+
+
+def train(update, collector, rollouts=4):
+    for _ in range(rollouts):
+        metrics = update(collector.rollout())
+    return metrics
+
+
+def prioritized(n_steps=1):
+    return lambda env: data.ReplayBuffer(env, 500, sampler=data.Prioritized(), n_steps=n_steps, seed=0)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{}, {"buffer": prioritized(3), "actor_delay": 2, "max_grad_norm": 1.0}, {"loss": "torchrl"}],
+    ids=["plain", "prioritized, 3 steps, delayed actor", "TorchRL's loss"],
+)
+def test_eager_equals_compiled(settings):
+    results = []
+    for compile in ("off", "on"):
+        update, collector = agent(compile, updates_per_step=0.15, **settings)  # few, as rounding may change a draw
+        metrics = train(update, collector)
+        results.append((weights(update), metrics))
+        assert (update.compile_seconds > 0) == (compile == "on")
+    (a, eager), (b, compiled) = results
+    torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-4)
+    assert eager == pytest.approx(compiled, rel=1e-2, abs=1e-2)
+
+
+def test_targets_follow_by_tau_and_nothing_trains_before_learning_starts():
+    update, collector = agent(tau=0.25)
+    assert train(update, collector, 1) == {} and update.updates == 0
+    update.buffer.extend(collector.rollout())
+    key = ("module", "layers", "0", "weight")
+    before = update.loss.target_qvalue_network_params.get(key).clone()
+    update.train(1)
+    after, source = update.loss.target_qvalue_network_params.get(key), update.loss.qvalue_network_params.get(key)
+    torch.testing.assert_close(after, before + 0.25 * (source - before))
+    assert not torch.equal(after, before)
+
+
+@pytest.mark.parametrize(("rate", "expected"), [(1.0, 96), (0.5, 48), (0.3, 28)])
+def test_updates_per_step(rate, expected):
+    update, collector = agent(updates_per_step=rate)  # 128 frames; the first 32 are too few to start
+    train(update, collector)
+    assert update.updates == expected
+
+
+def test_actor_delay_leaves_actor_and_temperature_alone_in_between():
+    update, collector = agent(actor_delay=2)
+    update.buffer.extend(collector.rollout())
+    update.buffer.extend(collector.rollout())
+    actor = lambda: torch.cat([*(p.detach().flatten() for p in collector.actor.parameters()), update.loss.log_alpha.detach()[None]])  # noqa: E731
+    critic = lambda: update.loss.qvalue_network_params.get(("module", "layers", "0", "weight")).detach().clone()  # noqa: E731
+    start, first = actor(), critic()
+    update.train(1)
+    second, between = actor(), critic()
+    update.train(1)
+    assert not torch.equal(start, second) and not torch.equal(first, between)
+    assert torch.equal(second, actor()) and not torch.equal(between, critic())
+
+
+def test_an_optimizer_without_a_functional_form_steps_outside():
+    update, collector = agent(optimizer=torch.optim.Adamax, actor_delay=2)
+    before = weights(update)
+    train(update, collector)
+    assert not torch.equal(before, weights(update))
+
+
+def test_learning_rates_of_groups():
+    torch.manual_seed(0)
+    env = envs.make("Pendulum-v1")
+    actor, critics = modules.tanh_normal_actor(env, (8,)), modules.q_value(env, hidden=(8,))
+    temperature = controllers.Temperature(-1.0)
+    loss = losses.SACLoss(actor, critics, temperature=temperature)
+    groups = [{"params": list(m.parameters()), "lr": lr} for m, lr in ((actor, 0.0), (critics, 1e-2), (temperature, 1e-3))]
+    update = updates.OffPolicyUpdate(
+        loss, data.ReplayBuffer(env, 100), torch.optim.Adam(groups), batch_size=16, learning_starts=16, compile="off"
+    )
+    before = [p.clone() for p in actor.parameters()]
+    update(collectors.VectorCollector(env, actor, frames_per_batch=32).rollout())
+    assert all(torch.equal(p, q) for p, q in zip(before, actor.parameters(), strict=True))
+    assert 0 < abs(temperature.log_alpha.item()) <= 0.033
+
+
+def test_priorities_are_written_back():
+    update, collector = agent(buffer=prioritized())
+    train(update, collector)
+    values = update.buffer.sampler.tree.values[: update.buffer.written]
+    assert values.unique().numel() > 60
+
+
+@pytest.mark.parametrize("loss", ["pgkit", "torchrl"])
+def test_takes_torchrl_s_replay_buffer(loss):
+    kinds = (ReplayBuffer, TensorDictReplayBuffer)
+    for kind in kinds:
+        update, collector = agent(buffer=lambda env, k=kind: k(storage=LazyTensorStorage(500), batch_size=32), loss=loss)
+        before = weights(update)
+        metrics = train(update, collector)
+        assert not torch.equal(before, weights(update)) and {"loss_actor", "loss_qvalue"} <= metrics.keys()
+
+
+def test_resumed_with_its_buffer_it_goes_on_bit_for_bit():
+    straight, collector = agent(num_envs=2)
+    train(straight, collector, 3)
+    other, twin = agent(seed=1, num_envs=2)
+    other.load_state_dict(copy.deepcopy(straight.state_dict()))
+    other.buffer.load_state_dict(straight.buffer.state_dict())
+    twin.load_state_dict(collector.state_dict())
+    finals = []
+    for update, source in ((straight, collector), (other, twin)):
+        torch.manual_seed(5)
+        train(update, source, 2)
+        finals.append(weights(update))
+    assert torch.equal(*finals)
+
+
+def test_refusals():
+    with pytest.raises(UserError, match="batch_size=128 is above the learning_starts=64 frames stored"):
+        agent(batch_size=128)
+
+
+@pytest.mark.slow
+def test_learns_pendulum():
+    torch.manual_seed(1)
+    env = envs.make("Pendulum-v1", seed=1)
+    actor = modules.tanh_normal_actor(env, (64, 64))
+    loss = losses.SACLoss(actor, modules.q_value(env, hidden=(64, 64)), gamma=0.98)
+    update = updates.OffPolicyUpdate(
+        loss, data.ReplayBuffer(env, 10_000), torch.optim.Adam(loss.parameters(), lr=1e-3), learning_starts=500, compile="on"
+    )
+    collector = collectors.VectorCollector(env, actor, frames_per_batch=1, total_frames=6_000, init_random_frames=500)
+    returns = []
+    for rollout in collector:
+        update(rollout)
+        if rollout["next", "done"].any():
+            returns.append(rollout["next", "episode_reward"].item())
+    assert sum(returns[-5:]) / 5 > -300, returns
