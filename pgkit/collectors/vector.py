@@ -13,6 +13,7 @@ from torch import Tensor
 from pgkit.collectors.policy import Act, output_keys, random_actions, trace
 from pgkit.collectors.stepping import allocate, fill
 from pgkit.collectors.workers import Workers
+from pgkit.compiling import worth_compiling
 from pgkit.envs import VectorEnv
 from pgkit.envs.arrays import episode_seed
 from pgkit.errors import UserError
@@ -36,6 +37,7 @@ class VectorCollector:
         total_frames: frames after which iteration stops (with the rollout that reaches them); -1: never.
         init_random_frames: the rollouts that begin before so many frames draw actions uniformly from the action spec;
             their log-probability is NaN.
+        compile: ``on``, ``off``, or ``auto``: where a C++ compiler is there and ``total_frames`` is large enough.
 
     Raises:
         UserError: sizes that do not fit, or an actor that was built for another environment.
@@ -49,6 +51,7 @@ class VectorCollector:
         frames_per_batch: int,
         total_frames: int = -1,
         init_random_frames: int = 0,
+        compile: str = "auto",
     ) -> None:
         if frames_per_batch < 1 or frames_per_batch % env.num_envs:
             raise UserError(
@@ -65,6 +68,8 @@ class VectorCollector:
         self.init_random_frames = init_random_frames
         self.frames = self._rollouts = 0
         self._steps = frames_per_batch // env.num_envs
+        steps = None if total_frames < 0 else total_frames / env.num_envs
+        self._compile = worth_compiling(compile, steps, least_calls=50_000)
         self._keys = output_keys(actor)
         self._outputs = dict(zip(self._keys, _example(env, actor), strict=True))
         self._workers: Workers | None = None
@@ -118,14 +123,14 @@ class VectorCollector:
 
     def _pool(self) -> Workers:
         if self._workers is None:
-            self._workers = Workers(self.env, self.actor, self._steps, self._outputs)
+            self._workers = Workers(self.env, self.actor, self._steps, self._outputs, self._compile)
         return self._workers
 
     def _policy(self) -> Act:
         """The traced actor, traced again if its tensors are other ones than before (moved, or replaced)."""
         tensors = [store[name].data_ptr() for store, name in self._tensors]
         if self._act is None or tensors != self._traced:
-            self._act, self._traced = trace(self.actor, torch.from_numpy(self.env.arrays.obs)), tensors
+            self._act, self._traced = trace(self.actor, torch.from_numpy(self.env.arrays.obs), self._compile), tensors
         return self._act
 
 

@@ -8,7 +8,7 @@ import traceback
 import weakref
 from itertools import pairwise
 from multiprocessing.connection import Connection
-from typing import Any
+from typing import Any, NamedTuple
 
 import cloudpickle
 import torch
@@ -18,7 +18,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import TensorSpec
 
-from pgkit.collectors.policy import output_keys, random_actions, trace
+from pgkit.collectors.policy import random_actions, trace
 from pgkit.collectors.stepping import Arrays, allocate, fill
 from pgkit.envs import ArrayEnv, VectorEnv
 
@@ -30,7 +30,12 @@ class Workers:
     """
 
     def __init__(
-        self, env: VectorEnv, actor: TensorDictModuleBase, steps: int, outputs: dict[NestedKey, Tensor]
+        self,
+        env: VectorEnv,
+        actor: TensorDictModuleBase,
+        steps: int,
+        outputs: dict[NestedKey, Tensor],
+        compile: bool,
     ) -> None:
         self._actor = copy.deepcopy(actor).requires_grad_(False).share_memory()
         obs = env.observation_spec["observation"].zero().numpy()
@@ -42,9 +47,11 @@ class Workers:
         processes = []
         for first, end in pairwise(bounds):
             ours, theirs = context.Pipe()
-            make_env = cloudpickle.dumps(env.make_env)
-            args = (theirs, make_env, first, end - first, env.num_envs, env.seed, self._actor, shared, env.action_spec, outputs)
-            process = context.Process(target=_serve, args=args, daemon=True)
+            share = _Share(
+                cloudpickle.dumps(env.make_env), first, end - first, env.num_envs, env.seed, env.action_spec,
+                self._actor, outputs, shared, compile,
+            )  # fmt: skip
+            process = context.Process(target=_serve, args=(theirs, share), daemon=True)
             process.start()
             theirs.close()
             self._pipes.append(ours)
@@ -92,33 +99,37 @@ class Workers:
         return answers
 
 
-def _serve(
-    pipe: Connection,
-    make_env: bytes,
-    first: int,
-    count: int,
-    num_envs: int,
-    seed: int,
-    actor: TensorDictModuleBase,
-    shared: dict[NestedKey, Tensor],
-    spec: TensorSpec,
-    outputs: dict[NestedKey, Tensor],
-) -> None:
+class _Share(NamedTuple):
+    """What a worker is given."""
+
+    make_env: bytes
+    first: int
+    count: int
+    num_envs: int
+    seed: int
+    action_spec: TensorSpec
+    actor: TensorDictModuleBase
+    outputs: dict[NestedKey, Tensor]
+    shared: dict[NestedKey, Tensor]
+    compile: bool
+
+
+def _serve(pipe: Connection, share: _Share) -> None:
     """A worker's life: answers ``(answer, failure)`` to every request until the pipe closes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
     try:
         torch.set_num_threads(1)
-        envs = ArrayEnv(cloudpickle.loads(make_env), count, seed, first)
-        act = trace(actor, torch.zeros(num_envs, *envs.obs.shape[1:]))
-        arrays = {key: tensor.numpy() for key, tensor in shared.items()}
+        envs = ArrayEnv(cloudpickle.loads(share.make_env), share.count, share.seed, share.first)
+        act = trace(share.actor, torch.zeros(share.num_envs, *envs.obs.shape[1:]), share.compile)
+        random_act = random_actions(share.action_spec, share.outputs)
+        arrays = {key: tensor.numpy() for key, tensor in share.shared.items()}
         pipe.send((None, None))
         while True:
             request, argument = pipe.recv()
             answer = None
             if request == "collect":
-                seed_of_rollout, random = argument
-                policy = random_actions(spec, outputs) if random else act
-                fill(arrays, envs, policy, output_keys(actor), num_envs, seed_of_rollout)
+                seed, random = argument
+                fill(arrays, envs, random_act if random else act, list(share.outputs), share.num_envs, seed)
             elif request == "state":
                 answer = envs.state_dict()
             else:

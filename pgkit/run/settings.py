@@ -3,6 +3,7 @@
 import argparse
 import dataclasses
 import json
+import logging
 import shlex
 import sys
 import typing
@@ -59,6 +60,8 @@ def launch(
         presets: env id pattern (as in a shell: ``dm_control/*``) -> settings; the first match is used.
         argv: the flags, without the program's name (default: ``sys.argv[1:]``).
     """
+    logging.basicConfig(format="%(message)s")  # to stderr
+    logging.getLogger("pgkit").setLevel(logging.INFO)
     try:
         main(parse(args_class, presets or {}, sys.argv[1:] if argv is None else argv))
     except UserError as error:

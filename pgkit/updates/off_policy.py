@@ -10,10 +10,11 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from pgkit.data import ReplayBuffer
+from pgkit.compiling import worth_compiling
 from pgkit.errors import UserError
 from pgkit.updates import optimizers, wiring
 from pgkit.updates.batches import Batches, OwnBatches, TorchRLBatches
-from pgkit.updates.step import GradientStep, worth_compiling
+from pgkit.updates.step import GradientStep
 from pgkit.updates.targets import averaging
 
 
@@ -35,7 +36,7 @@ class OffPolicyUpdate:
         learning_starts: frames in the replay before the first step, at least ``batch_size``.
         max_grad_norm: bound of the gradient's norm over all parameters; None: no bound.
         total_frames: frames of the whole training, for ``compile="auto"``.
-        compile: ``on``, ``off``, or ``auto`` (see :func:`~pgkit.updates.step.worth_compiling`).
+        compile: ``on``, ``off``, or ``auto`` (compile where at least 3,000 steps are expected).
 
     Raises:
         UserError: ``learning_starts`` is below ``batch_size``, or the buffer is too small for one batch.
@@ -134,7 +135,8 @@ class OffPolicyUpdate:
             "gather": self._batches.gather,
             "write_back": self._batches.write_back,
             # a step costs 10 times a PPO step, so compiling pays 10 times sooner
-            "compile": worth_compiling(self.compile, None if steps is None else 10 * steps),
+            "compile": worth_compiling(self.compile, steps, least_calls=3_000),
+            "may_fall_back": self.compile == "auto",
         }
         self._steps[True] = GradientStep(self.loss, self.optimizer, names, **settings)
         if self.actor_delay > 1:

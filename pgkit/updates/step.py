@@ -6,6 +6,7 @@ import time
 import types
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from logging import getLogger
 from typing import Any
 
 import torch
@@ -21,7 +22,7 @@ def _rows(data: TensorDictBase, index: Tensor) -> TensorDictBase:
 
 
 class GradientStep:
-    """``step(data, index) -> metrics``: one optimizer step on the sum of a loss's ``loss_*`` entries at ``data[index]``.
+    """``step(data, index) -> metrics``: one optimizer step on the sum of the ``loss_*`` entries at ``data[index]``.
 
     Compiled, all of it is one ``torch.compile(fullgraph=True)`` graph: the gather, the loss, ``autograd.grad``
     (traceable since ``trace_autograd_ops``), the norm clip, the optimizer's own function on the optimizer's own
@@ -39,6 +40,7 @@ class GradientStep:
         write_back: called with ``(data, index, minibatch)`` after the loss, without gradients (priorities).
         only: the ``loss_*`` entries to step on and the parameters each trains; the others stay. None: all.
         compile: compile the step.
+        may_fall_back: a step that cannot be compiled runs as it is, with a warning, in place of raising.
     """
 
     def __init__(
@@ -54,6 +56,7 @@ class GradientStep:
         write_back: Callable[[TensorDictBase, Tensor, TensorDictBase], None] | None = None,
         only: Mapping[str, Sequence[Tensor]] | None = None,
         compile: bool = False,
+        may_fall_back: bool = False,
     ) -> None:
         self.optimizer = optimizer
         self.names = [*names, "grad_norm"]
@@ -93,6 +96,7 @@ class GradientStep:
         step = types.FunctionType(code, step.__globals__, step.__name__, None, step.__closure__)
         self._eager, self._after, self._params = step, after, params
         self._compiled = _compile(step) if compile else None
+        self._may_fall_back = may_fall_back
 
     def begin(self) -> None:
         """Reads the learning rates off the optimizer; call it before a series of steps."""
@@ -108,9 +112,23 @@ class GradientStep:
                 metrics, grads = self._compiled(data, index)
         else:
             start = time.perf_counter()
+            if not self._seen:
+                getLogger("pgkit").info("compiling the update, once: 20 to 40 seconds, less when it is in the cache")
             with torch._dynamo.config.patch(trace_autograd_ops=True), warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # dynamo on tensordict's and TorchRL's code, nothing of the user's
-                metrics, grads = self._compiled(data, index)
+                try:
+                    metrics, grads = self._compiled(data, index)
+                except torch._dynamo.exc.TorchDynamoException as error:
+                    if not self._may_fall_back:
+                        raise
+                    self._compiled = None
+                    reason = str(error).strip().splitlines()[0]
+                    getLogger("pgkit").warning(
+                        "the update cannot be compiled and runs without, several times slower (%s); "
+                        "compile='on' shows the whole reason, compile='off' is silent",
+                        reason,
+                    )
+                    metrics, grads = self._eager(data, index)
             self.compile_seconds += time.perf_counter() - start
             self._seen.add(signature)
         if not self._in_graph:

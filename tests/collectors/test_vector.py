@@ -6,12 +6,12 @@ from pgkit.collectors.policy import trace
 from pgkit.errors import UserError
 
 
-def make(env_id="Pendulum-v1", workers=1, num_envs=4, steps=50, **kwargs):
+def make(env_id="Pendulum-v1", workers=1, num_envs=4, steps=50, compile="off", **kwargs):
     torch.manual_seed(0)
     env = envs.make(env_id, num_envs=num_envs, seed=3, workers=workers)
     build = modules.gaussian_actor if env.action_spec.dtype.is_floating_point else modules.categorical_actor
     actor = build(env, normalizer=modules.ObsNormalizer(env))
-    return actor, collectors.VectorCollector(env, actor, frames_per_batch=num_envs * steps, **kwargs)
+    return actor, collectors.VectorCollector(env, actor, frames_per_batch=num_envs * steps, compile=compile, **kwargs)
 
 
 def head_of(actor):
@@ -83,6 +83,23 @@ def test_new_weights_take_effect_and_the_global_generator_does_not():
     torch.testing.assert_close(quiet["action"], mean)
     head_of(actor).log_std = torch.nn.Parameter(torch.zeros(1))  # replaced, not changed in place
     assert (collector.rollout()["action"] - mean).abs().max() > 0.5
+
+
+def test_compiled_policy_sees_new_weights_and_agrees_for_any_number_of_workers():
+    rollouts = []
+    for workers, compile in ((1, "on"), (2, "on"), (1, "off")):
+        actor, collector = make("HalfCheetah-v5", workers=workers, steps=5, compile=compile)
+        collector.rollout()
+        with torch.no_grad():
+            for p in actor.parameters():
+                p.add_(0.3)
+            for key, buffer in actor.named_buffers():
+                buffer.fill_(2.0 if "var" in key else 0.1)
+        rollouts.append(collector.rollout())
+        collector.shutdown()
+    assert equal(rollouts[0], rollouts[1])
+    torch.testing.assert_close(rollouts[0][:, 0]["action"], rollouts[2][:, 0]["action"], rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(rollouts[0]["action_log_prob"], rollouts[2]["action_log_prob"], rtol=1e-3, atol=1e-3)
 
 
 @pytest.mark.parametrize(("before", "after"), [(1, 1), (2, 1), (1, 2)])

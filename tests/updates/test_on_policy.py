@@ -60,6 +60,22 @@ def test_two_compiled_agents_in_one_process_do_not_mix():
     assert not torch.equal(parameters(pair[0]) - start[0], parameters(pair[1]) - start[1])
 
 
+def test_what_cannot_be_compiled_runs_without(caplog):
+    def surrogate(log_ratio, advantage):
+        return log_ratio.exp() * advantage * float(advantage.detach().numpy().max() > -1e9)
+
+    def agent(mode):
+        update = make_agent(compile=mode, epochs=1)
+        update.loss.surrogate = surrogate
+        return update
+
+    metrics = agent("auto")(make_rollout())
+    assert "cannot be compiled and runs without" in caplog.text
+    assert metrics == pytest.approx(agent("off")(make_rollout()), rel=1e-4, abs=1e-5)
+    with pytest.raises(torch._dynamo.exc.TorchDynamoException):
+        agent("on")(make_rollout())
+
+
 @pytest.mark.parametrize(
     "optimizer",
     [
