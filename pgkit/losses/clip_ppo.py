@@ -90,7 +90,7 @@ class ClipPPOLoss(PolicyLoss):
         self.register_coeff_buffer("entropy_coeff", entropy_coeff)
         self.register_coeff_buffer("critic_coeff", critic_coeff)
         self.register_coeff_buffer("clip_value", low if clip_value is True else clip_value or None)
-        self.surrogate = surrogate or (lambda r, a: clip_surrogate(r, a, self.clip_low, self.clip_high))
+        self.surrogate = surrogate
         self.loss_critic_type, self.normalize_advantage = loss_critic_type, normalize_advantage
         self.entropy_bonus = entropy_bonus
 
@@ -116,13 +116,14 @@ class ClipPPOLoss(PolicyLoss):
             advantage = standardize(advantage)
 
         dist = self.distribution(batch)
-        log_prob, old_log_prob = (
-            dist.log_prob(batch[self.tensor_keys.action]),
-            batch[self.tensor_keys.sample_log_prob],
-        )
+        log_prob = dist.log_prob(batch[self.tensor_keys.action])
+        old_log_prob = batch[self.tensor_keys.sample_log_prob]
         same_shape(log_prob=log_prob, old_log_prob=old_log_prob)
         log_ratio = (log_prob - old_log_prob).unsqueeze(-1)
-        objective = self.surrogate(log_ratio, advantage)
+        if self.surrogate is None:
+            objective = clip_surrogate(log_ratio, advantage, self.clip_low, self.clip_high)
+        else:
+            objective = self.surrogate(log_ratio, advantage)
         same_shape(advantage=advantage, surrogate=objective)
 
         out = TensorDict({"loss_objective": self._reduce_loss(-objective, batch)})
