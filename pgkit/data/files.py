@@ -38,8 +38,8 @@ def restore(buffer: ReplayBuffer, saved: dict[str, Any]) -> None:
     for name, value in mine.items():
         if theirs.get(name) != value:
             raise UserError(
-                f"the saved replay buffer is another one: its {name} is {theirs.get(name)}, here it is {value}; give the "
-                "same environment and settings, or train without the saved buffer"
+                f"the saved replay buffer is another one: its {name} is {theirs.get(name)}, here it is {value}; "
+                "give the same environment and settings, or train without the saved buffer"
             )
     buffer.written, buffer.start, buffer.finals = saved["counters"]
     buffer.owner[: len(saved["owner"])] = saved["owner"]

@@ -25,7 +25,8 @@ class Prioritized:
 
     def __init__(self, alpha: float = 0.6, beta: float = 0.4, eps: float = 1e-6) -> None:
         self.alpha, self.eps = alpha, eps
-        self.beta, self.largest = torch.tensor(float(beta)), torch.ones((), dtype=torch.float64)
+        self.beta = torch.tensor(float(beta))
+        self.largest = torch.ones(1, dtype=torch.float64)  # [1]: a compiled graph loses writes to a float64 scalar
 
     def begin(self, rows: int) -> TensorDictBase:
         """Makes the tree; the result is what a batch's weights are made from."""

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from functools import partial
 from logging import getLogger
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -228,4 +228,4 @@ def _allocate(storage: Callable[[int], TensorStorage], example: dict[Any, Tensor
     log.setLevel("WARNING")  # TorchRL reports every allocation
     made.set(0, TensorDict(example))
     log.setLevel(level)
-    return made._storage  # get() is limited to the rows that were set through the storage itself
+    return cast(TensorDictBase, made._storage)  # get() is limited to the rows that were set through the storage itself

@@ -44,7 +44,7 @@ def bootstrap_target(
     gamma: float | Tensor,
     steps: Tensor | None = None,
 ) -> Tensor:
-    r""":math:`r + \gamma^n (1 - \text{terminated}) V(s_{t+n})`: a truncated episode bootstraps, a terminated one does not.
+    r""":math:`r + \gamma^n (1 - \text{terminated}) V(s_{t+n})`: truncation bootstraps, termination does not.
 
     Args:
         reward: ``[*B, 1]``; for ``n > 1`` the discounted sum of the ``n`` rewards.

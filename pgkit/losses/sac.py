@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import log
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -52,6 +52,7 @@ class SACLoss(QLoss):
         UserError: the actor is discrete.
     """
 
+    log_alpha: Tensor
     _schedulable_buffers: ClassVar[frozenset[str]] = frozenset({"gamma", "log_alpha"})
 
     def __init__(
@@ -79,7 +80,7 @@ class SACLoss(QLoss):
             actor_network, qvalue_network, num_qvalue_nets=num_qvalue_nets, gamma=gamma, delay_actor=delay_actor,
             delay_qvalue=delay_qvalue, separate_losses=separate_losses, reduction=reduction,
         )  # fmt: skip
-        self.temperature = temperature
+        self.temperature: Any = temperature
         if temperature is None:
             log_alpha = torch.tensor(log(alpha_init))
             if fixed_alpha:
@@ -115,7 +116,7 @@ class SACLoss(QLoss):
         """Entries of the result."""
         if self._out_keys is None:
             self._out_keys = ["loss_actor", "loss_qvalue", "loss_alpha", "alpha", "entropy", "q_value"]
-        return self._out_keys
+        return self._out_keys  # pyright: ignore[reportReturnType]
 
     @out_keys.setter
     def out_keys(self, keys: list[NestedKey]) -> None:

@@ -9,8 +9,8 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from pgkit.data import ReplayBuffer
 from pgkit.compiling import worth_compiling
+from pgkit.data import ReplayBuffer
 from pgkit.errors import UserError
 from pgkit.updates import optimizers, wiring
 from pgkit.updates.batches import Batches, OwnBatches, TorchRLBatches
@@ -119,7 +119,7 @@ class OffPolicyUpdate:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restores :meth:`state_dict`; with an empty replay, training waits until ``learning_starts`` frames are back."""
+        """Restores :meth:`state_dict`; with an empty replay, training waits for ``learning_starts`` frames."""
         self.loss.load_state_dict(state["loss"])
         self.optimizer.load_state_dict(state["optimizer"])
         self.frames, self.updates, self._due = state["counters"]

@@ -12,6 +12,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.compiler import is_compiling
 from torch.optim import SGD, Adam, AdamW, Optimizer, RMSprop
 from torch.optim.adam import adam
 from torch.optim.rmsprop import rmsprop
@@ -27,12 +28,12 @@ def parameters(optimizer: Optimizer) -> list[Tensor]:
 
 def functional(
     optimizer: Optimizer, fused: bool, params: list[Tensor] | None = None
-) -> tuple[Apply, Callable[[], None]] | None:
-    """``(apply, read_learning_rates)`` for Adam, AdamW, SGD and RMSprop, or None for any other optimizer.
+) -> tuple[Apply, Callable[[], None], list[Tensor]] | None:
+    """``(apply, read_learning_rates, rates)`` for Adam, AdamW, SGD and RMSprop, or None for any other optimizer.
 
     ``apply(grads)`` takes one gradient a parameter, in the order of :func:`parameters`, and can be traced.
-    ``read_learning_rates()`` copies the groups' ``lr`` into the tensors that the trace uses: annealing an ``lr`` never
-    recompiles. Adam moments and counters are made here if the optimizer has none yet.
+    ``read_learning_rates()`` copies the groups' ``lr`` into the tensors ``rates`` that the trace uses: annealing an
+    ``lr`` never recompiles. Adam moments and counters are made here if the optimizer has none yet.
 
     Args:
         optimizer: of exactly one of the classes above.
@@ -62,7 +63,7 @@ def functional(
         for group, rate in zip(sources, rates, strict=True):
             rate.fill_(group["lr"])
 
-    return apply, read_learning_rates
+    return apply, read_learning_rates, rates
 
 
 def _state(optimizer: Optimizer, group: dict[str, Any], *names: str) -> list[list[Tensor]]:
@@ -84,7 +85,7 @@ def _adam(optimizer: Optimizer, group: dict[str, Any], lr: Tensor, fused: bool) 
     def apply(grads: list[Tensor]) -> None:
         adam(
             group["params"], grads, averages, squares, maxima[0] if maxima else [], steps,
-            foreach=False, fused=fused, amsgrad=group["amsgrad"], beta1=beta1, beta2=beta2, lr=lr,
+            foreach=False, fused=fused, capturable=is_compiling(), amsgrad=group["amsgrad"], beta1=beta1, beta2=beta2, lr=lr,
             weight_decay=group["weight_decay"], eps=group["eps"], maximize=group["maximize"],
             decoupled_weight_decay=group.get("decoupled_weight_decay", False),
         )  # fmt: skip
@@ -115,7 +116,7 @@ def _rmsprop(optimizer: Optimizer, group: dict[str, Any], lr: Tensor, fused: boo
     def apply(grads: list[Tensor]) -> None:
         rmsprop(
             group["params"], grads, state["square_avg"], state.get("grad_avg", []), state.get("momentum_buffer", []),
-            state["step"], foreach=False, lr=lr, alpha=group["alpha"], eps=group["eps"],
+            state["step"], foreach=False, capturable=is_compiling(), lr=lr, alpha=group["alpha"], eps=group["eps"],
             weight_decay=group["weight_decay"], momentum=group["momentum"], centered=group["centered"],
             maximize=group["maximize"],
         )  # fmt: skip

@@ -7,7 +7,7 @@ import types
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from logging import getLogger
-from typing import Any
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDictBase
@@ -15,19 +15,22 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from pgkit.updates import optimizers
+from pgkit.updates.recorded import Step, recorded
 
 
 def _rows(data: TensorDictBase, index: Tensor) -> TensorDictBase:
-    return data[index]
+    return cast(TensorDictBase, data[index])
 
 
 class GradientStep:
     """``step(data, index) -> metrics``: one optimizer step on the sum of the ``loss_*`` entries at ``data[index]``.
 
-    Compiled, all of it is one ``torch.compile(fullgraph=True)`` graph: the gather, the loss, ``autograd.grad``
-    (traceable since ``trace_autograd_ops``), the norm clip, the optimizer's own function on the optimizer's own
-    state, and ``after``. Once a pair of shapes has been seen, calls skip dynamo's guards, which cost more than a small
-    step does. An optimizer without a functional form steps outside the graph.
+    Compiled, all of it is one graph: the gather, the loss, ``autograd.grad``, the norm clip, the optimizer's own
+    function on the optimizer's own state, and ``after``. There are two ways to the graph. With ``record``, the step is
+    recorded as tensor operations and compiled for exactly these tensors, without dynamo at run time
+    (:mod:`~pgkit.updates.recorded`). Otherwise, and for losses that cannot be recorded, it is one
+    ``torch.compile(fullgraph=True)`` graph; once a pair of shapes has been seen, calls skip dynamo's guards. An optimizer
+    without a functional form steps outside the graph.
 
     Args:
         loss: TorchRL ``LossModule`` or any module from TensorDict to TensorDict with ``loss_*`` entries.
@@ -40,6 +43,8 @@ class GradientStep:
         write_back: called with ``(data, index, minibatch)`` after the loss, without gradients (priorities).
         only: the ``loss_*`` entries to step on and the parameters each trains; the others stay. None: all.
         compile: compile the step.
+        record: try to record it first; the step may change no tensors but parameters, the loss's buffers and the
+            optimizer's state.
         may_fall_back: a step that cannot be compiled runs as it is, with a warning, in place of raising.
     """
 
@@ -56,18 +61,19 @@ class GradientStep:
         write_back: Callable[[TensorDictBase, Tensor, TensorDictBase], None] | None = None,
         only: Mapping[str, Sequence[Tensor]] | None = None,
         compile: bool = False,
+        record: bool = False,
         may_fall_back: bool = False,
     ) -> None:
-        self.optimizer = optimizer
+        self.optimizer, self.loss = optimizer, loss
         self.names = [*names, "grad_norm"]
         self.compile_seconds = 0.0
-        self._seen: set[Any] = set()
+        self._runs: dict[Any, Step] = {}
         params = optimizers.parameters(optimizer)
         if only is not None:
             kept = {id(p) for reached in only.values() for p in reached}
             params = [p for p in params if id(p) in kept]
         functional = optimizers.functional(optimizer, fused=not compile, params=params)
-        apply, self._read_learning_rates = functional or (None, lambda: None)
+        apply, self._read_learning_rates, self._rates = functional or (None, lambda: None, [])
         self._in_graph = apply is not None
 
         def step(data: TensorDictBase, index: Tensor) -> tuple[Tensor, list[Tensor]]:
@@ -95,8 +101,7 @@ class GradientStep:
         code = step.__code__.replace(co_name=f"step_{id(self)}")
         step = types.FunctionType(code, step.__globals__, step.__name__, None, step.__closure__)
         self._eager, self._after, self._params = step, after, params
-        self._compiled = _compile(step) if compile else None
-        self._may_fall_back = may_fall_back
+        self._compile, self._record, self._may_fall_back = compile, record, may_fall_back
 
     def begin(self) -> None:
         """Reads the learning rates off the optimizer; call it before a series of steps."""
@@ -104,33 +109,19 @@ class GradientStep:
 
     def __call__(self, data: TensorDictBase, index: Tensor) -> Tensor:
         """One step on the rows ``index`` of ``data``; metrics ``[len(names)]``, still on the device."""
+        if not self._compile:
+            return self.eager(data, index)
         signature = (index.shape, data.batch_size)
-        if self._compiled is None:
-            metrics, grads = self._eager(data, index)
-        elif signature in self._seen:
-            with torch.compiler.set_stance("default", skip_guard_eval_unsafe=True):
-                metrics, grads = self._compiled(data, index)
+        if signature in self._runs:
+            metrics, grads = self._runs[signature](data, index)
         else:
             start = time.perf_counter()
-            if not self._seen:
-                getLogger("pgkit").info("compiling the update, once: 20 to 40 seconds, less when it is in the cache")
-            with torch._dynamo.config.patch(trace_autograd_ops=True), warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # dynamo on tensordict's and TorchRL's code, nothing of the user's
-                try:
-                    metrics, grads = self._compiled(data, index)
-                except torch._dynamo.exc.TorchDynamoException as error:
-                    if not self._may_fall_back:
-                        raise
-                    self._compiled = None
-                    reason = str(error).strip().splitlines()[0]
-                    getLogger("pgkit").warning(
-                        "the update cannot be compiled and runs without, several times slower (%s); "
-                        "compile='on' shows the whole reason, compile='off' is silent",
-                        reason,
-                    )
-                    metrics, grads = self._eager(data, index)
+            if not self._runs:
+                getLogger("pgkit").info("compiling the update, once: up to 40 seconds, less when it is in the cache")
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # the compiler's, on tensordict's and TorchRL's code
+                self._runs[signature], (metrics, grads) = self._build(data, index)
             self.compile_seconds += time.perf_counter() - start
-            self._seen.add(signature)
         if not self._in_graph:
             self._optimizer_step(grads)
         return metrics
@@ -151,7 +142,32 @@ class GradientStep:
             with torch.no_grad():
                 self._after()
 
+    def _build(self, data: TensorDictBase, index: Tensor) -> tuple[Step, tuple[Tensor, list[Tensor]]]:
+        """The compiled step for these shapes, and the result of its first call."""
+        if self._record:
+            states = [x for p in self._params for x in self.optimizer.state.get(p, {}).values() if torch.is_tensor(x)]
+            held = [*self._params, *states, *self._rates, *self.loss.parameters(), *self.loss.buffers()]
+            try:
+                run = recorded(self._eager, list({id(x): x for x in held}.values()), data, index)
+                return run, run(data, index)
+            except RuntimeError as error:
+                getLogger("pgkit").debug("the step cannot be recorded (%s): torch.compile", error)
+        # fallback_random: the same random numbers as eager code
+        compiled = torch.compile(self._eager, fullgraph=True, dynamic=False, options={"fallback_random": True})
 
-def _compile(function: Callable[..., Any]) -> Callable[..., Any]:
-    # fallback_random: the same random numbers as eager code
-    return torch.compile(function, fullgraph=True, dynamic=False, options={"fallback_random": True})
+        def run(data: TensorDictBase, index: Tensor) -> tuple[Tensor, list[Tensor]]:
+            with torch.compiler.set_stance("default", skip_guard_eval_unsafe=True):
+                return compiled(data, index)
+
+        try:
+            with torch._dynamo.config.patch(trace_autograd_ops=True):
+                return run, compiled(data, index)
+        except torch._dynamo.exc.TorchDynamoException as error:
+            if not self._may_fall_back:
+                raise
+            getLogger("pgkit").warning(
+                "the update cannot be compiled and runs without, several times slower (%s); compile='on' shows the "
+                "whole reason, compile='off' is silent",
+                str(error).strip().splitlines()[0],
+            )
+            return self._eager, self._eager(data, index)

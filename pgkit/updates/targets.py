@@ -25,7 +25,7 @@ def target_pairs(loss: nn.Module) -> list[tuple[Tensor, Tensor]]:
 
 
 def averaging(loss: nn.Module, tau: float) -> Callable[[], None] | None:
-    r"""A function that moves the targets: :math:`\theta' \leftarrow \theta' + \tau (\theta - \theta')`; buffers are copied.
+    r"""Moves the targets: :math:`\theta' \leftarrow \theta' + \tau (\theta - \theta')`; buffers are copied.
 
     None for a loss without delayed parameters.
     """

@@ -78,7 +78,7 @@ def test_every_frame_kept_is_the_frame_written(num_envs, steps, n_steps):
 def test_n_steps_stop_at_a_truncation_and_at_a_termination():
     # rewards 1..6; step 1 is truncated (true final observation 50), step 4 terminates (60); n = 3, gamma 0.9:
     # t=0: 1 + 0.9*2 = 2.8, two steps, next 50, not terminated; t=1: 2, one step, next 50
-    # t=2: 3 + 0.9*4 + 0.81*5 = 10.65, three steps, next 60, terminated; t=3: 4 + 0.9*5 = 8.5, two steps, next 60, terminated
+    # t=2: 3 + 0.9*4 + 0.81*5 = 10.65, three steps, next 60, terminated; t=3: 4 + 0.9*5 = 8.5, two steps, the same
     buffer = data.ReplayBuffer(envs.make("Pendulum-v1"), 100, n_steps=3)
     rollout = hand_made([0, 1, 2, 3, 4, 5, 6], [1, 2, 3, 4, 5, 6], {4}, {1}, {1: 50.0, 4: 60.0})
     buffer.extend(rollout)

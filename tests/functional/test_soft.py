@@ -39,7 +39,7 @@ def test_temperature_rises_while_entropy_is_below_its_target():
     # entropy 1 (log-prob -1), target 2: loss = -log_alpha * (-1 + 2), so d loss / d log_alpha = -1: it rises
     block = Temperature(target_entropy=2.0, alpha_init=0.5)
     block.loss(torch.tensor([-1.0])).sum().backward()
-    assert block.log_alpha.grad.item() == -1.0
+    assert block.log_alpha.grad is not None and block.log_alpha.grad.item() == -1.0
     assert block.alpha.item() == pytest.approx(0.5) and not block.alpha.requires_grad
     assert block.loss(torch.tensor([-1.0])).item() == pytest.approx(math.log(2))
 

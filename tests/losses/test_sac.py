@@ -116,7 +116,9 @@ def test_agrees_with_torchrl(distance):
     for loss in (mine, theirs):
         SoftUpdate(loss, tau=0.1)
     for ours, other in zip(
-        mine.target_qvalue_network_params.values(True, True), theirs.target_qvalue_network_params.values(True, True), strict=True
+        mine.target_qvalue_network_params.values(True, True),
+        theirs.target_qvalue_network_params.values(True, True),
+        strict=True,
     ):
         other.data.copy_(ours.data.add_(torch.randn_like(ours)))
     data = batch(obs=17, actions=6)
@@ -142,7 +144,11 @@ def test_each_term_trains_its_own_parameters_and_an_ensemble_is_its_members():
     loss = losses.SACLoss(actor, critics)
     SoftUpdate(loss, tau=0.1)
     out = loss(batch())
-    groups = {"loss_actor": [*actor.parameters()], "loss_qvalue": [*critics.parameters()], "loss_alpha": [loss.log_alpha]}
+    groups = {
+        "loss_actor": [*actor.parameters()],
+        "loss_qvalue": [*critics.parameters()],
+        "loss_alpha": [loss.log_alpha],
+    }
     for key, mine in groups.items():
         for name, params in groups.items():
             grads = torch.autograd.grad(out[key], params, allow_unused=True, retain_graph=True)

@@ -22,12 +22,16 @@ def agent(compile="off", *, seed=0, buffer=None, loss="pgkit", num_envs=1, optim
         module.make_value_estimator(gamma=0.9)
     buffer = data.ReplayBuffer(env, 500, seed=0) if buffer is None else buffer(env)
     settings = {"batch_size": 32, "learning_starts": 64, **kwargs}
-    update = updates.OffPolicyUpdate(module, buffer, optimizer(module.parameters(), lr=1e-2), compile=compile, **settings)
+    update = updates.OffPolicyUpdate(
+        module, buffer, optimizer(module.parameters(), lr=1e-2), compile=compile, **settings
+    )
     return update, collectors.VectorCollector(env, actor, frames_per_batch=32 * num_envs)
 
 
 def weights(update):
-    return torch.cat([x.detach().flatten().float() for x in update.loss.state_dict().values() if isinstance(x, torch.Tensor)])
+    return torch.cat(
+        [x.detach().flatten().float() for x in update.loss.state_dict().values() if isinstance(x, torch.Tensor)]
+    )
 
 
 def train(update, collector, rollouts=4):
@@ -80,8 +84,15 @@ def test_actor_delay_leaves_actor_and_temperature_alone_in_between():
     update, collector = agent(actor_delay=2)
     update.buffer.extend(collector.rollout())
     update.buffer.extend(collector.rollout())
-    actor = lambda: torch.cat([*(p.detach().flatten() for p in collector.actor.parameters()), update.loss.log_alpha.detach()[None]])  # noqa: E731
-    critic = lambda: update.loss.qvalue_network_params.get(("module", "layers", "0", "weight")).detach().clone()  # noqa: E731
+
+    def actor():
+        return torch.cat(
+            [*(p.detach().flatten() for p in collector.actor.parameters()), update.loss.log_alpha.detach()[None]]
+        )
+
+    def critic():
+        return update.loss.qvalue_network_params.get(("module", "layers", "0", "weight")).detach().clone()
+
     start, first = actor(), critic()
     update.train(1)
     second, between = actor(), critic()
@@ -103,7 +114,9 @@ def test_learning_rates_of_groups():
     actor, critics = modules.tanh_normal_actor(env, (8,)), modules.q_value(env, hidden=(8,))
     temperature = controllers.Temperature(-1.0)
     loss = losses.SACLoss(actor, critics, temperature=temperature)
-    groups = [{"params": list(m.parameters()), "lr": lr} for m, lr in ((actor, 0.0), (critics, 1e-2), (temperature, 1e-3))]
+    groups = [
+        {"params": list(m.parameters()), "lr": lr} for m, lr in ((actor, 0.0), (critics, 1e-2), (temperature, 1e-3))
+    ]
     update = updates.OffPolicyUpdate(
         loss, data.ReplayBuffer(env, 100), torch.optim.Adam(groups), batch_size=16, learning_starts=16, compile="off"
     )
@@ -116,6 +129,7 @@ def test_learning_rates_of_groups():
 def test_priorities_are_written_back():
     update, collector = agent(buffer=prioritized())
     train(update, collector)
+    assert update.buffer.sampler is not None
     values = update.buffer.sampler.tree.values[: update.buffer.written]
     assert values.unique().numel() > 60
 
@@ -124,7 +138,9 @@ def test_priorities_are_written_back():
 def test_takes_torchrl_s_replay_buffer(loss):
     kinds = (ReplayBuffer, TensorDictReplayBuffer)
     for kind in kinds:
-        update, collector = agent(buffer=lambda env, k=kind: k(storage=LazyTensorStorage(500), batch_size=32), loss=loss)
+        update, collector = agent(
+            buffer=lambda env, k=kind: k(storage=LazyTensorStorage(500), batch_size=32), loss=loss
+        )
         before = weights(update)
         metrics = train(update, collector)
         assert not torch.equal(before, weights(update)) and {"loss_actor", "loss_qvalue"} <= metrics.keys()
@@ -157,7 +173,11 @@ def test_learns_pendulum():
     actor = modules.tanh_normal_actor(env, (64, 64))
     loss = losses.SACLoss(actor, modules.q_value(env, hidden=(64, 64)), gamma=0.98)
     update = updates.OffPolicyUpdate(
-        loss, data.ReplayBuffer(env, 10_000), torch.optim.Adam(loss.parameters(), lr=1e-3), learning_starts=500, compile="on"
+        loss,
+        data.ReplayBuffer(env, 10_000),
+        torch.optim.Adam(loss.parameters(), lr=1e-3),
+        learning_starts=500,
+        compile="on",
     )
     collector = collectors.VectorCollector(env, actor, frames_per_batch=1, total_frames=6_000, init_random_frames=500)
     returns = []
@@ -166,3 +186,12 @@ def test_learns_pendulum():
         if rollout["next", "done"].any():
             returns.append(rollout["next", "episode_reward"].item())
     assert sum(returns[-5:]) / 5 > -300, returns
+
+
+def test_compiled_writes_to_scalars_outlive_the_step():
+    """A compiled graph silently loses writes to a float64 scalar; the largest priority is therefore ``[1]``."""
+    update, collector = agent("on", buffer=prioritized())
+    update.buffer.extend(collector.rollout())
+    update.train(2)
+    sampler = update.buffer.sampler
+    assert sampler is not None and sampler.largest.item() == sampler.tree.values.max().item() != 1.0

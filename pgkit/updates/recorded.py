@@ -1,0 +1,74 @@
+"""A step recorded as tensor operations and compiled without dynamo, whose own cost is that of a small step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from pgkit.compiling import compile_record, record
+
+Step = Callable[[TensorDictBase, Tensor], tuple[Tensor, list[Tensor]]]
+
+
+def recorded(step: Step, held: Sequence[Tensor], data: TensorDictBase, index: Tensor) -> Step:
+    """``step`` as one compiled graph, for data and indices of these shapes.
+
+    The recording runs the step, and so does a check that the compiled graph repeats it on other rows; both are undone.
+
+    Args:
+        step: changes tensors of ``held`` in place, and no others.
+        held: parameters, buffers, optimizer state and learning rates, each once.
+        data: example rows ``[rows]``.
+        index: example indices ``[B]``.
+
+    Raises:
+        RuntimeError: the step decides something on a tensor's value, works on a tensor that shares memory with one of
+            ``held`` without being it, or does not repeat itself on other rows.
+    """
+    keys = list(data.keys(True, True))
+
+    def flat(*inputs: Tensor) -> list[Tensor]:
+        leaves = dict(zip(keys, inputs[len(held) : -1], strict=True))
+        metrics, grads = step(TensorDict({}, data.batch_size).update(leaves), inputs[-1])
+        return [metrics, *grads]
+
+    before = [tensor.detach().clone() for tensor in held]
+
+    def undone(function: Callable[[], Any]) -> Any:
+        """The function's result; what it did to ``held`` and to the random generator is undone."""
+        try:
+            with torch.random.fork_rng(devices=[]):
+                return function()
+        finally:
+            with torch.no_grad():
+                for tensor, value in zip(held, before, strict=True):
+                    tensor.copy_(value)
+
+    graph = undone(lambda: record(flat, [*held, *(data[key] for key in keys), index]))
+    memory = {tensor.untyped_storage().data_ptr() for tensor in held}
+    for node in graph.graph.find_nodes(op="get_attr"):
+        constant = getattr(graph, str(node.target))
+        if isinstance(constant, Tensor) and constant.untyped_storage().data_ptr() in memory:
+            raise RuntimeError(f"tracing: '{node.target}' shares memory with a parameter or buffer without being it")
+    fixed = [tensor.detach() for tensor in held]
+    code = compile_record(graph, [*fixed, *(data[key] for key in keys), index])
+    rows, leaves = data, [data[key] for key in keys]
+
+    def run(data: TensorDictBase, index: Tensor) -> tuple[Tensor, list[Tensor]]:
+        nonlocal rows, leaves
+        if data is not rows:
+            rows, leaves = data, [data[key] for key in keys]
+        with torch.no_grad():
+            metrics, *grads = code(*fixed, *leaves, index)
+        return metrics, grads
+
+    # a decision taken on values outside torch (numpy) is not seen while recording: it would show on other rows
+    other = torch.randperm(len(data), generator=torch.Generator().manual_seed(0))[: len(index)].to(index.device)
+    expected, got = (undone(lambda f=f: f(data, other)[0]) for f in (step, run))
+    if not torch.allclose(got, expected, rtol=1e-3, atol=1e-4, equal_nan=True):
+        raise RuntimeError(f"the recorded step does not repeat the step on other rows: {got} is not {expected}")
+    return run

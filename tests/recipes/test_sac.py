@@ -1,0 +1,69 @@
+"""The SAC recipe as a user runs it."""
+
+import json
+
+import pytest
+
+from tests.recipes.test_ppo import pgkit, rows
+
+
+def train(run_dir, *argv, frames=600):
+    flags = [
+        "--env-id",
+        "Pendulum-v1",
+        "--eval-every",
+        300,
+        "--eval-episodes",
+        1,
+        "--random-frames",
+        100,
+        "--log-every",
+        50,
+    ]
+    small = ["--batch-size", 32, "--hidden", 16, "--threads", 1, "--compile", "off"]
+    return pgkit("run", "sac", *flags, *small, "--total-frames", frames, "--run-dir", run_dir, *argv)
+
+
+def test_resumed_with_its_buffer_it_equals_the_straight_run(tmp_path):
+    train(tmp_path / "straight", "--save-buffer")
+    train(tmp_path / "resumed", "--save-buffer", frames=300)
+    pgkit("run", "sac", "--resume", tmp_path / "resumed", "--total-frames", 600)
+    assert rows(tmp_path / "straight") == rows(tmp_path / "resumed")
+    assert rows(tmp_path / "straight")[-1]["train/loss_qvalue"]
+
+
+def test_resumed_without_its_buffer_it_says_so_and_goes_on(tmp_path):
+    train(tmp_path / "run", frames=300)
+    done = pgkit("run", "sac", "--resume", tmp_path / "run", "--total-frames", 600)
+    assert "resumed without the replay buffer" in done.stdout + done.stderr
+    assert int(rows(tmp_path / "run")[-1]["frames"]) == 600
+
+
+@pytest.mark.parametrize(
+    "flags",
+    [
+        ("--env-id", "Hopper-v5", "--num-envs", 2, "--steps", 5, "--workers", 2, "--actor-delay", 2),
+        ("--env-id", "dm_control/cartpole-swingup-v0", "--action-repeat", 4, "--n-steps", 3, "--prioritized"),
+        ("--env-id", "Pendulum-v1", "--alpha", 0.1, "--updates-per-step", 0.25),
+    ],
+)
+def test_runs_for_a_few_hundred_frames(tmp_path, flags):
+    train(tmp_path / "run", *flags, frames=300)
+    assert json.loads((tmp_path / "run" / "summary.json").read_text())["frames"] >= 300
+
+
+def test_memmap_buffer(tmp_path):
+    train(tmp_path / "run", "--buffer-dir", tmp_path / "replay", "--buffer-size", 500, frames=300)
+    assert any((tmp_path / "replay").rglob("*.memmap"))
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (("--env-id", "CartPole-v1"), "categorical_actor"),
+        (("--batch-size", 256, "--buffer-size", 0), "capacity"),
+    ],
+)
+def test_mistakes_are_one_line_and_exit_2(tmp_path, flags, message):
+    done = pgkit("run", "sac", "--run-dir", tmp_path / "run", *flags, ok=False)
+    assert done.returncode == 2 and message in done.stderr and "Traceback" not in done.stderr
