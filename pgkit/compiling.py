@@ -1,9 +1,19 @@
-"""When to compile."""
+"""When to compile, and compiling without dynamo."""
 
 from __future__ import annotations
 
 import shutil
+from collections.abc import Callable, Sequence
 from logging import getLogger
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.fx import GraphModule
+from torch.fx.experimental.proxy_tensor import make_fx
+
+# the same random numbers as eager code; tensors referred to, never copied into the code as numbers
+_OPTIONS: dict[str, Any] = {"fallback_random": True, "always_keep_tensor_constants": True}
 
 
 def worth_compiling(compile: str, calls: float | None, least_calls: float) -> bool:
@@ -22,3 +32,20 @@ def worth_compiling(compile: str, calls: float | None, least_calls: float) -> bo
         getLogger("pgkit").warning("no C++ compiler (g++) found: running without torch.compile, about 3 times slower")
         return False
     return calls is None or calls >= least_calls
+
+
+def record(function: Callable[..., Any], inputs: Sequence[Tensor]) -> GraphModule:
+    """The tensor operations of ``function(*inputs)``, gradients and in-place changes included, as a graph.
+
+    The function runs once, for real, and believes that it is being compiled; a decision that it takes on a tensor's
+    value raises ``RuntimeError``. Tensors that it uses without being given them are referred to.
+    """
+    with torch.compiler._compile_session_context():
+        return make_fx(function)(*inputs)
+
+
+def compile_record(graph: GraphModule, inputs: Sequence[Tensor]) -> Callable[..., Any]:
+    """Inductor's code for a recorded graph. It checks nothing: call it with tensors like ``inputs`` and no others."""
+    with torch.no_grad():
+        options = {**_OPTIONS, "size_asserts": False, "alignment_asserts": False}
+        return torch._inductor.compile(graph, list(inputs), options=options)

@@ -10,9 +10,10 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torch.fx.experimental.proxy_tensor import make_fx
 from torchrl.data import TensorSpec
 from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from pgkit.compiling import compile_record, record
 
 Act = Callable[[Tensor], tuple[Tensor, ...]]
 
@@ -43,18 +44,14 @@ def trace(actor: TensorDictModuleBase, obs: Tensor, compile: bool = False) -> Ac
 
     with torch.no_grad(), torch.random.fork_rng(devices=[]), set_exploration_type(ExplorationType.RANDOM):
         try:
-            # TorchRL's TanhNormal tests its bounds in Python unless it is being compiled, which is what this is
-            with torch.compiler._compile_session_context():
-                graph = make_fx(act)(obs)
+            graph = record(act, [obs])
         except RuntimeError as error:
             if "proxy" not in str(error) and "trac" not in str(error):
                 raise
             return act
         if not compile:
             return graph.forward
-        # small tensors would otherwise be copied into the code as numbers
-        options = {"fallback_random": True, "always_keep_tensor_constants": True}
-        return torch._inductor.compile(graph, [obs], options=options)
+        return compile_record(graph, [obs])
 
 
 def random_actions(spec: TensorSpec, outputs: dict[NestedKey, Tensor]) -> Act:

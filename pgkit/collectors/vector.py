@@ -76,7 +76,9 @@ class VectorCollector:
         self._act: Act | None = None
         self._traced: list[int] = []
         stores = [store for module in actor.modules() for store in (module._parameters, module._buffers)]
-        self._tensors = [(store, name) for store in stores for name, x in store.items() if x is not None]
+        self._tensors: list[tuple[Any, str]] = [
+            (store, name) for store in stores for name, x in store.items() if x is not None
+        ]
 
     def __iter__(self) -> Iterator[TensorDictBase]:
         while self.total_frames < 0 or self.frames < self.total_frames:
