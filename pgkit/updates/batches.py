@@ -44,8 +44,16 @@ class OwnBatches:
 
     def __init__(self, buffer: ReplayBuffer, loss: nn.Module, batch_size: int) -> None:
         self.buffer, self.batch_size = buffer, batch_size
-        self.extend, self.write_back = buffer.extend, buffer.write_back
-        self.gather = buffer.gather(discount(loss) if buffer.n_steps > 1 else 1.0)
+        self._gather = buffer.gather(discount(loss) if buffer.n_steps > 1 else 1.0)
+
+    def extend(self, rollout: TensorDictBase) -> None:
+        self.buffer.extend(rollout)
+
+    def gather(self, data: TensorDictBase, index: Tensor) -> TensorDictBase:
+        return self._gather(data, index)
+
+    def write_back(self, data: TensorDictBase, index: Tensor, batch: TensorDictBase) -> None:
+        self.buffer.write_back(data, index, batch)
 
     def draw(self, batches: int) -> Iterator[Draw]:
         at_once = 1 if self.buffer.sampler is not None else max(batches, 1)  # priorities change with every step

@@ -192,6 +192,6 @@ def test_compiled_writes_to_scalars_outlive_the_step():
     """A compiled graph silently loses writes to a float64 scalar; the largest priority is therefore ``[1]``."""
     update, collector = agent("on", buffer=prioritized())
     update.buffer.extend(collector.rollout())
-    update.train(2)
+    update.train(1)
     sampler = update.buffer.sampler
     assert sampler is not None and sampler.largest.item() == sampler.tree.values.max().item() != 1.0
