@@ -122,10 +122,11 @@ def main(args: Args) -> None:
             total_frames=args.total_frames,
             compile=args.compile,
         )
-        make_collector = {"pgkit": collectors.VectorCollector, "torchrl": collectors.TorchRLCollector}[args.collector]
-        collector = make_collector(
-            env, actor, frames_per_batch=args.num_envs * args.steps, total_frames=args.total_frames
-        )
+        sizes = {"frames_per_batch": args.num_envs * args.steps, "total_frames": args.total_frames}
+        if args.collector == "pgkit":
+            collector = collectors.VectorCollector(env, actor, **sizes, compile=args.compile)
+        else:
+            collector = collectors.TorchRLCollector(env, actor, **sizes)
 
         log.track(policy=actor, eval_env=partial(envs.make, args.env_id), update=update, collector=collector)
         for rollout in collector:
@@ -134,7 +135,8 @@ def main(args: Args) -> None:
                 normalizer.update(rollout["observation"])
             if scale is not None:
                 scale.update(rollout["value_target"])
-            log.step(collector.frames, rollout, metrics, compile_seconds=update.compile_seconds)
+            compile_seconds = update.compile_seconds + collector.compile_seconds
+            log.step(collector.frames, rollout, metrics, compile_seconds=compile_seconds)
         collector.shutdown()
 
 

@@ -125,6 +125,7 @@ def main(args: Args) -> None:
             frames_per_batch=args.num_envs * args.steps,
             total_frames=args.total_frames,
             init_random_frames=args.random_frames,
+            compile=args.compile,
         )
 
         replay = data.BesideCheckpoint(buffer, log.dir / "checkpoints" / "buffer.pt", save=args.save_buffer)
@@ -134,7 +135,8 @@ def main(args: Args) -> None:
             metrics = update(rollout) or metrics
             episodes += finished_episodes(rollout)
             if collector.frames // args.log_every > logged // args.log_every or collector.frames >= args.total_frames:
-                log.step(collector.frames, None, metrics, compile_seconds=update.compile_seconds, episodes=episodes)
+                compile_seconds = update.compile_seconds + collector.compile_seconds
+                log.step(collector.frames, None, metrics, compile_seconds=compile_seconds, episodes=episodes)
                 episodes, logged = [], collector.frames
         collector.shutdown()
 

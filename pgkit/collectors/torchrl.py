@@ -36,7 +36,7 @@ class TorchRLCollector:
         from torchrl.collectors import Collector  # slow to import, and rarely needed
 
         env = TransformedEnv(env, Compose(RewardSum(), StepCounter()))
-        self.frames = 0
+        self.frames, self.compile_seconds = 0, 0.0
         kwargs = {"trust_policy": True, "auto_register_policy_transforms": True} | kwargs
         self.collector = Collector(env, actor, frames_per_batch=frames_per_batch, total_frames=total_frames, **kwargs)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -67,6 +68,7 @@ class VectorCollector:
         self.frames_per_batch, self.total_frames = frames_per_batch, total_frames
         self.init_random_frames = init_random_frames
         self.frames = self._rollouts = 0
+        self.compile_seconds = 0.0  # recording and compiling the policy, starting the workers
         self._steps = frames_per_batch // env.num_envs
         steps = None if total_frames < 0 else total_frames / env.num_envs
         self._compile = worth_compiling(compile, steps, least_calls=50_000)
@@ -125,14 +127,18 @@ class VectorCollector:
 
     def _pool(self) -> Workers:
         if self._workers is None:
+            start = time.perf_counter()
             self._workers = Workers(self.env, self.actor, self._steps, self._outputs, self._compile)
+            self.compile_seconds += time.perf_counter() - start
         return self._workers
 
     def _policy(self) -> Act:
         """The traced actor, traced again if its tensors are other ones than before (moved, or replaced)."""
         tensors = [store[name].data_ptr() for store, name in self._tensors]
         if self._act is None or tensors != self._traced:
+            start = time.perf_counter()
             self._act, self._traced = trace(self.actor, torch.from_numpy(self.env.arrays.obs), self._compile), tensors
+            self.compile_seconds += time.perf_counter() - start
         return self._act
 
 

@@ -85,8 +85,8 @@ def _adam(optimizer: Optimizer, group: dict[str, Any], lr: Tensor, fused: bool) 
     def apply(grads: list[Tensor]) -> None:
         adam(
             group["params"], grads, averages, squares, maxima[0] if maxima else [], steps,
-            foreach=False, fused=fused, capturable=is_compiling(), amsgrad=group["amsgrad"], beta1=beta1, beta2=beta2, lr=lr,
-            weight_decay=group["weight_decay"], eps=group["eps"], maximize=group["maximize"],
+            foreach=False, fused=fused, capturable=is_compiling(), amsgrad=group["amsgrad"], beta1=beta1, beta2=beta2,
+            lr=lr, weight_decay=group["weight_decay"], eps=group["eps"], maximize=group["maximize"],
             decoupled_weight_decay=group.get("decoupled_weight_decay", False),
         )  # fmt: skip
 

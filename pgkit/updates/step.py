@@ -29,8 +29,8 @@ class GradientStep:
     function on the optimizer's own state, and ``after``. There are two ways to the graph. With ``record``, the step is
     recorded as tensor operations and compiled for exactly these tensors, without dynamo at run time
     (:mod:`~pgkit.updates.recorded`). Otherwise, and for losses that cannot be recorded, it is one
-    ``torch.compile(fullgraph=True)`` graph; once a pair of shapes has been seen, calls skip dynamo's guards. An optimizer
-    without a functional form steps outside the graph.
+    ``torch.compile(fullgraph=True)`` graph; once a pair of shapes has been seen, calls skip dynamo's guards. An
+    optimizer without a functional form steps outside the graph.
 
     Args:
         loss: TorchRL ``LossModule`` or any module from TensorDict to TensorDict with ``loss_*`` entries.
@@ -155,13 +155,13 @@ class GradientStep:
         # fallback_random: the same random numbers as eager code
         compiled = torch.compile(self._eager, fullgraph=True, dynamic=False, options={"fallback_random": True})
 
-        def run(data: TensorDictBase, index: Tensor) -> tuple[Tensor, list[Tensor]]:
+        def run_compiled(data: TensorDictBase, index: Tensor) -> tuple[Tensor, list[Tensor]]:
             with torch.compiler.set_stance("default", skip_guard_eval_unsafe=True):
                 return compiled(data, index)
 
         try:
             with torch._dynamo.config.patch(trace_autograd_ops=True):
-                return run, compiled(data, index)
+                return run_compiled, compiled(data, index)
         except torch._dynamo.exc.TorchDynamoException as error:
             if not self._may_fall_back:
                 raise
