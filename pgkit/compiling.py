@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable, Sequence
 from logging import getLogger
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -48,4 +48,4 @@ def compile_record(graph: GraphModule, inputs: Sequence[Tensor]) -> Callable[...
     """Inductor's code for a recorded graph. It checks nothing: call it with tensors like ``inputs`` and no others."""
     with torch.no_grad():
         options = {**_OPTIONS, "size_asserts": False, "alignment_asserts": False}
-        return torch._inductor.compile(graph, list(inputs), options=options)
+        return cast(Callable[..., Any], torch._inductor.compile(graph, list(inputs), options=options))
