@@ -197,12 +197,15 @@ def test_target_kl_stops_after_the_epoch():
 def test_schedules_reach_optimizer_and_loss():
     schedules = {"lr": controllers.linear(1.0, 0.0), "entropy_coeff": controllers.linear(0.2, 0.1)}
     update = make_agent(schedules=schedules, total_frames=256)
+    start = parameters(update).clone()
     update(make_rollout())
     assert update.optimizer.param_groups[0]["lr"] == 1.0
-    before = parameters(update).clone()
+    assert (parameters(update) - start).abs().max() > 0.1
     metrics = update(make_rollout())
     assert metrics["learning_rate"] == 0.5 and update.loss.entropy_coeff.item() == pytest.approx(0.15)
-    assert (parameters(update) - before).abs().max() > 0.1
+    before = parameters(update).clone()
+    update(make_rollout())  # the end: a learning rate of zero
+    assert torch.equal(parameters(update), before)
     with pytest.raises(UserError, match="give total_frames too"):
         make_agent(schedules=schedules)
 
