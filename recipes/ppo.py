@@ -71,8 +71,8 @@ PRESETS = {
         normalize_obs=False, scale_returns=False, critic_coeff=0.5,
     ),
     "Pendulum-*": dict(
-        total_frames=200_000, eval_every=50_000, steps=128, learning_rate=1e-3, gamma=0.95, log_std=0.0,
-        normalize_advantage="minibatch",
+        total_frames=200_000, eval_every=50_000, steps=128, minibatch_size=128, learning_rate=1e-3, anneal=True,
+        gamma=0.95, log_std=0.5, normalize_advantage="minibatch",
     ),
     "HalfCheetah-*": dict(lmbda=0.9),
     "dm_control/*": dict(),
