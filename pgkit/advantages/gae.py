@@ -15,7 +15,7 @@ from pgkit.functional import generalized_advantage
 class GAE(TensorDictModuleBase):
     """Writes ``advantage``, ``value_target`` and ``state_value`` (``[*B, T, 1]``) into a rollout ``[*B, T]``.
 
-    Schulman et al., 2016 (https://arxiv.org/abs/1506.02438). The critic runs once on every observation, and
+    Schulman et al., 2016 (https://arxiv.org/abs/1506.02438). In one call, the critic reads every observation, and
     besides only on the true final observations of episodes and the rollout's last: elsewhere the next value is the
     value one step on. This block owns gamma and lambda.
 
