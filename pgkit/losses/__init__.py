@@ -1,8 +1,10 @@
 """Losses: one file an algorithm, each a TorchRL ``LossModule``."""
 
-from pgkit.losses.base import PolicyLoss
+from pgkit.losses.base import Loss
 from pgkit.losses.clip_ppo import ClipPPOLoss
+from pgkit.losses.policy_base import PolicyLoss
 from pgkit.losses.q_base import QLoss
 from pgkit.losses.sac import SACLoss
+from pgkit.losses.soft_base import SoftQLoss
 
-__all__ = ["ClipPPOLoss", "PolicyLoss", "QLoss", "SACLoss"]
+__all__ = ["ClipPPOLoss", "Loss", "PolicyLoss", "QLoss", "SACLoss", "SoftQLoss"]

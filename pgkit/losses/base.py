@@ -1,141 +1,66 @@
-"""TorchRL's loss plumbing, written once."""
+"""What every loss here shares: TorchRL's ``LossModule`` contract, written once."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
 from typing import Any
 
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torch.distributions import Distribution
-from torchrl.modules.distributions.utils import sample_and_log_prob
 from torchrl.objectives import LossModule
-from torchrl.objectives.utils import ValueEstimators, dispatch_value_estimator
 
 
-class PolicyLoss(LossModule):
-    """Base of the losses of an actor and a state-value critic on on-policy data.
+class Loss(LossModule):
+    """A TorchRL ``LossModule`` whose subclass says what it reads and writes in two methods.
 
-    It holds both networks as TorchRL losses do (``actor_network``, ``actor_network_params``, ...), names the keys,
-    and gives subclasses three verbs: :meth:`distribution`, :meth:`log_prob`, :meth:`value`. A subclass writes
-    ``forward`` and names its results in ``metrics``.
+    A family's base (:class:`~pgkit.losses.PolicyLoss`, :class:`~pgkit.losses.QLoss`) holds the networks; an algorithm's
+    file writes ``forward``.
 
     Args:
-        actor_network: probabilistic actor.
-        critic_network: value operator; None for losses without one.
-        separate_losses: parameters that both networks share are trained by the policy's loss only.
-        reduction: ``mean``, ``sum`` or ``none``.
+        reduction: ``mean``, ``sum`` or ``none``; None is ``mean``.
     """
 
-    @dataclass
-    class _AcceptedKeys:
-        """Keys that :meth:`set_keys` can change, with TorchRL's names and defaults."""
-
-        advantage: NestedKey = "advantage"
-        value_target: NestedKey = "value_target"
-        value: NestedKey = "state_value"
-        sample_log_prob: NestedKey = "action_log_prob"
-        action: NestedKey = "action"
-        reward: NestedKey = "reward"
-        done: NestedKey = "done"
-        terminated: NestedKey = "terminated"
-
-    default_keys = _AcceptedKeys
-    default_value_estimator = ValueEstimators.GAE
     out_keys: Sequence[NestedKey]
     actor_network: TensorDictModule
     actor_network_params: Any
     target_actor_network_params: Any
-    critic_network: TensorDictModule | None
-    critic_network_params: Any
-    target_critic_network_params: Any
 
-    def __init__(
-        self,
-        actor_network: TensorDictModule,
-        critic_network: TensorDictModule | None = None,
-        *,
-        separate_losses: bool = False,
-        reduction: str | None = None,
-    ) -> None:
+    def __init__(self, reduction: str | None = None) -> None:
         self._in_keys = self._out_keys = None
         super().__init__()
         self.reduction = "mean" if reduction is None else reduction
-        self.convert_to_functional(actor_network, "actor_network")
-        if critic_network is None:
-            self.critic_network = None
-        else:
-            shared = list(actor_network.parameters()) if separate_losses else None
-            self.convert_to_functional(critic_network, "critic_network", compare_against=shared)
-        action, log_prob = actor_network.dist_sample_keys, actor_network.log_prob_keys
-        self.set_keys(action=action[0], sample_log_prob=log_prob[0])
 
-    def distribution(self, batch: TensorDictBase) -> Distribution:
-        """The policy's distribution at the batch's observations; the batch is left as it is."""
-        with self.actor_network_params.to_module(self.actor_network):
-            return self.actor_network.get_dist(batch.select(*self.actor_network.in_keys))
+    def _reads(self) -> list[NestedKey]:
+        """Every entry that ``forward`` reads; a key may come twice."""
+        raise NotImplementedError
 
-    def value(self, batch: TensorDictBase) -> Tensor:
-        """The critic's value of the batch's observations, ``[*B, 1]``."""
-        assert self.critic_network is not None
-        with self.critic_network_params.to_module(self.critic_network):
-            out = self.critic_network(batch.select(*self.critic_network.in_keys))
-        return out.get(self.tensor_keys.value)
-
-    def entropy(self, dist: Distribution) -> Tensor:
-        """Entropy ``[*B]``: closed form, or minus the log-probability of one reparametrized sample."""
-        try:
-            return dist.entropy()
-        except NotImplementedError:
-            return -sample_and_log_prob(dist, reparameterize=dist.has_rsample)[1]
-
-    def get_advantage(self, batch: TensorDictBase) -> Tensor:
-        """The batch's advantage, computed by this loss's own estimator only if the user made one."""
-        if self.tensor_keys.advantage not in batch.keys(True):
-            if self._value_estimator is None:
-                raise KeyError(
-                    f"the batch has no '{self.tensor_keys.advantage}', which {type(self).__name__} reads: run an "
-                    "advantage block on the rollout first (advantages.GAE(critic)(rollout)), or call "
-                    "loss.make_value_estimator()"
-                )
-            self._value_estimator(
-                batch,
-                params=self.critic_network_params.detach(),
-                target_params=self.target_critic_network_params,
-            )
-        return batch.get(self.tensor_keys.advantage)
-
-    def make_value_estimator(self, value_type: ValueEstimators | None = None, **hyperparams: Any) -> PolicyLoss:
-        """As in TorchRL; returns the loss."""
-        value_type, hp = self._prepare_value_estimator_kwargs(value_type, **hyperparams)
-        if value_type is not None:
-            names = ("advantage", "value", "value_target", "reward", "done", "terminated", "sample_log_prob")
-            keys = {name: getattr(self.tensor_keys, name) for name in names}
-            supported = {value_type: value_type.name}
-            dispatch_value_estimator(self, value_type, supported=supported, tensor_keys=keys, **hp)
-        return self
+    def _writes(self) -> list[NestedKey]:
+        """Entries of ``forward``'s result."""
+        raise NotImplementedError
 
     @property
     def in_keys(self) -> list[NestedKey]:
         """Every entry that ``forward`` reads."""
         if self._in_keys is None:
-            networks = [net for net in (self.actor_network, self.critic_network) if net is not None]
-            keys = [key for net in networks for key in net.in_keys]
-            self._in_keys = list(dict.fromkeys([*keys, *self._read_keys()]))
+            self._in_keys = list(dict.fromkeys(self._reads()))
         return list(self._in_keys)
 
     @in_keys.setter
     def in_keys(self, keys: list[NestedKey] | None) -> None:
         self._in_keys = keys
 
-    def _read_keys(self) -> list[NestedKey]:
-        """Entries that ``forward`` reads besides the networks' inputs."""
-        keys = self.tensor_keys
-        read = [keys.action, keys.sample_log_prob, keys.advantage]
-        return read if self.critic_network is None else [*read, keys.value_target, keys.value]
+    @property
+    def out_keys(self) -> list[NestedKey]:
+        """Entries of the result."""
+        if self._out_keys is None:
+            self._out_keys = self._writes()
+        return list(self._out_keys)
+
+    @out_keys.setter
+    def out_keys(self, keys: list[NestedKey]) -> None:
+        self._out_keys = keys
 
     def set_keys(self, **kwargs: NestedKey) -> None:
         """As in TorchRL: renames the entries the loss reads."""
@@ -143,11 +68,8 @@ class PolicyLoss(LossModule):
         self._in_keys = None
 
     def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
-        if self._value_estimator is not None:
-            accepted = {field.name for field in fields(self._value_estimator._AcceptedKeys)}
-            self._value_estimator.set_keys(**{k: v for k, v in kwargs.items() if k in accepted})
+        pass
 
-
-def standardize(x: Tensor) -> Tensor:
-    """Zero mean and unit standard deviation over all elements, which is what PPO does to a minibatch's advantage."""
-    return (x - x.mean()) / x.std().clamp_min(1e-6)
+    def reduce(self, loss: Tensor, batch: TensorDictBase) -> Tensor:
+        """The unreduced ``[*B]`` or ``[*B, 1]`` as this loss's ``reduction`` wants it; padded entries are left out."""
+        return self._reduce_loss(loss, batch)

@@ -18,7 +18,7 @@ from pgkit.functional import (
     same_shape,
     value_loss,
 )
-from pgkit.losses.base import PolicyLoss, standardize
+from pgkit.losses.policy_base import PolicyLoss, standardize
 
 Surrogate = Callable[[Tensor, Tensor], Tensor]
 
@@ -94,18 +94,10 @@ class ClipPPOLoss(PolicyLoss):
         self.loss_critic_type, self.normalize_advantage = loss_critic_type, normalize_advantage
         self.entropy_bonus = entropy_bonus
 
-    @property
-    def out_keys(self) -> list[NestedKey]:
-        """Entries of the result."""
-        if self._out_keys is None:
-            entropy = ["loss_entropy", "entropy"] if self.entropy_bonus else []
-            critic = [] if self.critic_network is None else ["loss_critic", "explained_variance"]
-            self._out_keys = ["loss_objective", *entropy, *critic, "approx_kl", "clip_fraction"]
-        return list(self._out_keys)
-
-    @out_keys.setter
-    def out_keys(self, keys: list[NestedKey]) -> None:
-        self._out_keys = keys
+    def _writes(self) -> list[NestedKey]:
+        entropy = ["loss_entropy", "entropy"] if self.entropy_bonus else []
+        critic = [] if self.critic_network is None else ["loss_critic", "explained_variance"]
+        return ["loss_objective", *entropy, *critic, "approx_kl", "clip_fraction"]
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -126,10 +118,10 @@ class ClipPPOLoss(PolicyLoss):
             objective = self.surrogate(log_ratio, advantage)
         same_shape(advantage=advantage, surrogate=objective)
 
-        out = TensorDict({"loss_objective": self._reduce_loss(-objective, batch)})
+        out = TensorDict({"loss_objective": self.reduce(-objective, batch)})
         if self.entropy_bonus:
             entropy = self.entropy(dist)
-            out["loss_entropy"] = self._reduce_loss(-self.entropy_coeff * entropy, batch)
+            out["loss_entropy"] = self.reduce(-self.entropy_coeff * entropy, batch)
             out["entropy"] = entropy.detach().mean()
         if self.critic_network is not None:
             value, target = self.value(batch), batch[self.tensor_keys.value_target]
@@ -138,7 +130,7 @@ class ClipPPOLoss(PolicyLoss):
             else:
                 old_value = batch[self.tensor_keys.value]
                 error = clipped_value_loss(value, target, old_value, self.clip_value, self.loss_critic_type)
-            out["loss_critic"] = self._reduce_loss(self.critic_coeff * error, batch)
+            out["loss_critic"] = self.reduce(self.critic_coeff * error, batch)
             out["explained_variance"] = explained_variance(value.detach(), target)
 
         ratio = log_ratio.detach().exp()

@@ -12,13 +12,13 @@ from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.modules.distributions.utils import rsample_and_log_prob
-from torchrl.objectives import LossModule
 from torchrl.objectives.utils import ValueEstimators, _vmap_func
 
 from pgkit.functional import bootstrap_target
+from pgkit.losses.base import Loss
 
 
-class QLoss(LossModule):
+class QLoss(Loss):
     """Base of the losses of an actor and an ensemble of action values, with delayed target networks.
 
     It holds the networks as TorchRL does (``qvalue_network_params``, ``target_qvalue_network_params``, ...), owns the
@@ -54,11 +54,7 @@ class QLoss(LossModule):
 
     default_keys = _AcceptedKeys
     default_value_estimator = ValueEstimators.TD0
-    out_keys: Sequence[NestedKey]
     gamma: Tensor
-    actor_network: TensorDictModule
-    actor_network_params: Any
-    target_actor_network_params: Any
     qvalue_network: TensorDictModule
     qvalue_network_params: Any
     target_qvalue_network_params: Any
@@ -75,9 +71,7 @@ class QLoss(LossModule):
         separate_losses: bool = False,
         reduction: str | None = None,
     ) -> None:
-        self._in_keys = self._out_keys = None
-        super().__init__()
-        self.reduction = "mean" if reduction is None else reduction
+        super().__init__(reduction)
         self.register_coeff_buffer("gamma", gamma)
         self.convert_to_functional(actor_network, "actor_network", create_target_params=delay_actor)
         several = isinstance(qvalue_network, Sequence) and not isinstance(qvalue_network, torch.nn.Module)
@@ -130,24 +124,7 @@ class QLoss(LossModule):
             self.gamma.fill_(hyperparams["gamma"])
         return self
 
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """Every entry that ``forward`` reads."""
-        if self._in_keys is None:
-            keys, networks = self.tensor_keys, [*self.actor_network.in_keys, *self.qvalue_network.in_keys]
-            after = [*self.actor_network.in_keys, keys.reward, keys.done, keys.terminated]
-            after = [("next", *((key,) if isinstance(key, str) else key)) for key in after]
-            self._in_keys = list(dict.fromkeys([keys.action, *networks, *after]))
-        return self._in_keys
-
-    @in_keys.setter
-    def in_keys(self, keys: list[NestedKey] | None) -> None:
-        self._in_keys = keys
-
-    def set_keys(self, **kwargs: NestedKey) -> None:
-        """As in TorchRL: renames the entries the loss reads."""
-        super().set_keys(**kwargs)
-        self._in_keys = None
-
-    def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
-        pass
+    def _reads(self) -> list[NestedKey]:
+        keys, networks = self.tensor_keys, [*self.actor_network.in_keys, *self.qvalue_network.in_keys]
+        after = [*self.actor_network.in_keys, keys.reward, keys.done, keys.terminated]
+        return [keys.action, *networks, *[("next", *((key,) if isinstance(key, str) else key)) for key in after]]

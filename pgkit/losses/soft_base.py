@@ -1,0 +1,116 @@
+"""What the entropy-regularized off-policy losses share: the temperature and TorchRL's settings for it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import log
+from typing import Any, ClassVar
+
+import torch
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+from torchrl.data import TensorSpec
+
+from pgkit.errors import UserError
+from pgkit.functional import temperature_loss
+from pgkit.losses.q_base import QLoss
+
+
+class SoftQLoss(QLoss):
+    r"""Base of SAC and its descendants: a :class:`~pgkit.losses.QLoss` with a temperature :math:`\alpha`.
+
+    Args:
+        actor_network: probabilistic actor.
+        qvalue_network: :func:`pgkit.modules.q_value`, or what ``QLoss`` takes besides.
+        temperature: block that replaces the five settings that follow, e.g. :class:`pgkit.controllers.Temperature`.
+        alpha_init: temperature at the start.
+        min_alpha, max_alpha: its bounds; None: none.
+        fixed_alpha: do not train it.
+        target_entropy: :math:`\bar H`; ``auto`` is minus the number of action dimensions.
+        action_spec: spec of one action; names the dimensions before the first batch does.
+        loss_function: ``l2``, ``l1`` or ``smooth_l1``.
+        num_qvalue_nets, gamma, delay_actor, delay_qvalue, separate_losses, reduction: as in ``QLoss``.
+
+    Raises:
+        UserError: the actor is discrete and the loss is not (``takes_discrete``).
+    """
+
+    takes_discrete: ClassVar[bool] = False
+    log_alpha: Tensor
+    _schedulable_buffers: ClassVar[frozenset[str]] = frozenset({"gamma", "log_alpha"})
+
+    def __init__(
+        self,
+        actor_network: TensorDictModule,
+        qvalue_network: TensorDictModule | Sequence[TensorDictModule],
+        *,
+        temperature: nn.Module | None = None,
+        alpha_init: float = 1.0,
+        min_alpha: float | None = None,
+        max_alpha: float | None = None,
+        fixed_alpha: bool = False,
+        target_entropy: str | float = "auto",
+        action_spec: TensorSpec | None = None,
+        loss_function: str = "l2",
+        num_qvalue_nets: int = 2,
+        gamma: float = 0.99,
+        delay_actor: bool = False,
+        delay_qvalue: bool = True,
+        separate_losses: bool = False,
+        reduction: str | None = None,
+    ) -> None:
+        if not self.takes_discrete:
+            _refuse_discrete(type(self).__name__, actor_network)
+        super().__init__(
+            actor_network, qvalue_network, num_qvalue_nets=num_qvalue_nets, gamma=gamma, delay_actor=delay_actor,
+            delay_qvalue=delay_qvalue, separate_losses=separate_losses, reduction=reduction,
+        )  # fmt: skip
+        self.temperature: Any = temperature
+        if temperature is None:
+            log_alpha = torch.tensor(log(alpha_init))
+            if fixed_alpha:
+                self.register_buffer("log_alpha", log_alpha)
+            else:
+                self.log_alpha = nn.Parameter(log_alpha)
+        self._log_bounds = (log(min_alpha) if min_alpha else None, log(max_alpha) if max_alpha else None)
+        self.fixed_alpha, self.loss_function = fixed_alpha, loss_function
+        self._target_entropy = None if target_entropy == "auto" else float(target_entropy)
+        if self._target_entropy is None and action_spec is not None:
+            self._target_entropy = -float(action_spec.shape[-1:].numel())
+
+    @property
+    def alpha(self) -> Tensor:
+        r"""The temperature :math:`\alpha`, a detached scalar."""
+        if self.temperature is not None:
+            return self.temperature.alpha
+        with torch.no_grad():
+            bounded = self._log_bounds != (None, None)
+            return (self.log_alpha.clamp_(*self._log_bounds) if bounded else self.log_alpha).exp()
+
+    @property
+    def target_entropy(self) -> float:
+        r""":math:`\bar H`; with ``auto`` and no ``action_spec``, known after the first batch."""
+        if self.temperature is not None:
+            return self.temperature.target_entropy
+        if self._target_entropy is None:
+            raise AttributeError("target_entropy='auto' is read off the first batch of actions: none was seen yet")
+        return self._target_entropy
+
+    def temperature_loss(self, action: Tensor, log_prob: Tensor) -> Tensor:
+        """Unreduced ``[*B]`` loss of the temperature at actions ``[*B, actions]`` drawn now, ``log_prob [*B]``."""
+        log_prob = log_prob.detach()
+        if self.temperature is not None:
+            return self.temperature.loss(log_prob)
+        if self._target_entropy is None:
+            self._target_entropy = -action.numel() / log_prob.numel()
+        return temperature_loss(self.log_alpha, log_prob, self._target_entropy)
+
+
+def _refuse_discrete(loss: str, actor: TensorDictModule) -> None:
+    for module in actor.modules():
+        kind = getattr(module, "distribution_class", None)
+        if kind is not None and not getattr(kind, "has_rsample", True):
+            raise UserError(
+                f"{loss} needs an actor over continuous actions, this one is {kind.__name__}: use "
+                "modules.tanh_normal_actor, or for discrete actions modules.categorical_actor with losses.ClipPPOLoss or TorchRL's DiscreteSACLoss"
+            )
