@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 from tensordict import TensorDictBase
@@ -22,7 +21,6 @@ class Loss(LossModule):
         reduction: ``mean``, ``sum`` or ``none``; None is ``mean``.
     """
 
-    out_keys: Sequence[NestedKey]
     actor_network: TensorDictModule
     actor_network_params: Any
     target_actor_network_params: Any
@@ -52,7 +50,7 @@ class Loss(LossModule):
         self._in_keys = keys
 
     @property
-    def out_keys(self) -> list[NestedKey]:
+    def out_keys(self) -> list[NestedKey]:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Entries of the result."""
         if self._out_keys is None:
             self._out_keys = self._writes()

@@ -112,5 +112,6 @@ def _refuse_discrete(loss: str, actor: TensorDictModule) -> None:
         if kind is not None and not getattr(kind, "has_rsample", True):
             raise UserError(
                 f"{loss} needs an actor over continuous actions, this one is {kind.__name__}: use "
-                "modules.tanh_normal_actor, or for discrete actions modules.categorical_actor with losses.ClipPPOLoss or TorchRL's DiscreteSACLoss"
+                "modules.tanh_normal_actor, or for discrete actions modules.categorical_actor with "
+                "losses.ClipPPOLoss or TorchRL's DiscreteSACLoss"
             )
