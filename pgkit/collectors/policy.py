@@ -14,6 +14,8 @@ from torchrl.data import TensorSpec
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from pgkit.compiling import compile_record, record
+from pgkit.envs import VectorEnv
+from pgkit.errors import UserError
 
 Act = Callable[[Tensor], tuple[Tensor, ...]]
 
@@ -62,3 +64,25 @@ def random_actions(spec: TensorSpec, outputs: dict[NestedKey, Tensor]) -> Act:
         return tuple(spec.rand() if key == "action" else others[key] for key in outputs)
 
     return act
+
+
+def example(env: VectorEnv, actor: TensorDictModuleBase) -> tuple[Tensor, ...]:
+    """The actor's outputs for observations of zeros, checked against the environment's action spec."""
+    obs, spec = env.observation_spec["observation"].zero(), env.action_spec
+    data = TensorDict({"observation": obs}, batch_size=(env.num_envs,))
+    misfit = "the actor was built for another environment: build it from this one (modules.gaussian_actor(env))"
+    with torch.no_grad(), torch.random.fork_rng(devices=[]):
+        try:
+            out = actor(data)
+        except RuntimeError as error:
+            reason = str(error.__cause__ or error).strip().splitlines()[-1]
+            raise UserError(
+                f"the actor cannot read observations of shape {tuple(obs.shape[1:])}; {misfit} [{reason}]"
+            ) from error
+    action = out["action"]
+    if action.shape != spec.shape or action.dtype.is_floating_point != spec.dtype.is_floating_point:
+        raise UserError(
+            f"the actor's action is {tuple(action.shape[1:])} {action.dtype}, the environment's "
+            f"{tuple(spec.shape[1:])} {spec.dtype}; {misfit}"
+        )
+    return tuple(out[key] for key in output_keys(actor))

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
+from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
@@ -58,3 +59,13 @@ def fill(arrays: Arrays, envs: ArrayEnv, act: Act, keys: Sequence[NestedKey], nu
             result[t] = output.numpy()[rows]
         next_obs[t], reward[t], terminated[t], truncated[t] = envs.step(action[t])
         episode_reward[t], step_count[t] = envs.episode_reward, envs.step_count
+
+
+def as_rollout(arrays: Arrays) -> TensorDictBase:
+    """The arrays ``[T, N, ...]`` as a TensorDict ``[N, T]``, without a copy, and ``("next", "done")``."""
+    tensors = {key: torch.from_numpy(array).transpose(0, 1) for key, array in arrays.items()}
+    tensors["next", "done"] = tensors["next", "terminated"] | tensors["next", "truncated"]
+    rollout = TensorDict({}, batch_size=tensors["next", "done"].shape[:2])
+    for key, tensor in tensors.items():
+        rollout.set(key, tensor)
+    return rollout

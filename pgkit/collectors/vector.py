@@ -7,12 +7,11 @@ from collections.abc import Iterator
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor
 
-from pgkit.collectors.policy import Act, output_keys, random_actions, trace
-from pgkit.collectors.stepping import allocate, fill
+from pgkit.collectors.policy import Act, example, output_keys, random_actions, trace
+from pgkit.collectors.stepping import allocate, as_rollout, fill
 from pgkit.collectors.workers import Workers
 from pgkit.compiling import worth_compiling
 from pgkit.envs import VectorEnv
@@ -73,7 +72,7 @@ class VectorCollector:
         steps = None if total_frames < 0 else total_frames / env.num_envs
         self._compile = worth_compiling(compile, steps, least_calls=50_000)
         self._keys = output_keys(actor)
-        self._outputs = dict(zip(self._keys, _example(env, actor), strict=True))
+        self._outputs = dict(zip(self._keys, example(env, actor), strict=True))
         self._workers: Workers | None = None
         self._act: Act | None = None
         self._traced: list[int] = []
@@ -91,7 +90,8 @@ class VectorCollector:
         seed = episode_seed(self.env.seed, -1 % 2**32, self._rollouts)
         random = self.frames < self.init_random_frames
         if self.env.workers > 1:
-            arrays = self._pool().collect(self.actor, seed, random)
+            self._pool().begin(self.actor.state_dict().values(), seed, random)
+            arrays = self._pool().finish()
         else:
             obs = self.env.arrays.obs
             arrays = allocate(self._steps, obs, self._outputs)
@@ -100,12 +100,7 @@ class VectorCollector:
                 fill(arrays, self.env.arrays, act, self._keys, self.env.num_envs, seed)
         self.frames += self.frames_per_batch
         self._rollouts += 1
-        tensors = {key: torch.from_numpy(array).transpose(0, 1) for key, array in arrays.items()}
-        tensors["next", "done"] = tensors["next", "terminated"] | tensors["next", "truncated"]
-        rollout = TensorDict({}, batch_size=(self.env.num_envs, self._steps))
-        for key, tensor in tensors.items():
-            rollout.set(key, tensor)
-        return rollout
+        return as_rollout(arrays)
 
     def state_dict(self) -> dict[str, Any]:
         """Counters, and every environment's state (see :class:`~pgkit.envs.ArrayEnv`)."""
@@ -140,25 +135,3 @@ class VectorCollector:
             self._act, self._traced = trace(self.actor, torch.from_numpy(self.env.arrays.obs), self._compile), tensors
             self.compile_seconds += time.perf_counter() - start
         return self._act
-
-
-def _example(env: VectorEnv, actor: TensorDictModuleBase) -> tuple[Tensor, ...]:
-    """The actor's outputs for observations of zeros, checked against the environment's action spec."""
-    obs, spec = env.observation_spec["observation"].zero(), env.action_spec
-    data = TensorDict({"observation": obs}, batch_size=(env.num_envs,))
-    misfit = "the actor was built for another environment: build it from this one (modules.gaussian_actor(env))"
-    with torch.no_grad(), torch.random.fork_rng(devices=[]):
-        try:
-            out = actor(data)
-        except RuntimeError as error:
-            reason = str(error.__cause__ or error).strip().splitlines()[-1]
-            raise UserError(
-                f"the actor cannot read observations of shape {tuple(obs.shape[1:])}; {misfit} [{reason}]"
-            ) from error
-    action = out["action"]
-    if action.shape != spec.shape or action.dtype.is_floating_point != spec.dtype.is_floating_point:
-        raise UserError(
-            f"the actor's action is {tuple(action.shape[1:])} {action.dtype}, the environment's "
-            f"{tuple(spec.shape[1:])} {spec.dtype}; {misfit}"
-        )
-    return tuple(out[key] for key in output_keys(actor))

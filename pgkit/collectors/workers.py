@@ -6,6 +6,7 @@ import copy
 import signal
 import traceback
 import weakref
+from collections.abc import Iterable, Sequence
 from itertools import pairwise
 from multiprocessing.connection import Connection
 from typing import Any, NamedTuple
@@ -24,9 +25,17 @@ from pgkit.envs import ArrayEnv, VectorEnv
 
 
 class Workers:
-    """``env.workers`` processes; :meth:`collect` returns one rollout's arrays.
+    """Processes that share some of the environments; :meth:`begin` and :meth:`finish` make one rollout's arrays.
 
     The rollout and the policy's weights are in shared memory: a rollout costs two messages a process.
+
+    Args:
+        env: all the environments.
+        actor: the policy.
+        steps: steps each environment takes for a rollout.
+        outputs: examples of what the policy writes.
+        compile: compile the policy.
+        bounds: the environments ``bounds[i]`` to ``bounds[i + 1]`` are process i's; None: all, evenly.
     """
 
     def __init__(
@@ -36,16 +45,17 @@ class Workers:
         steps: int,
         outputs: dict[NestedKey, Tensor],
         compile: bool,
+        bounds: Sequence[int] | None = None,
     ) -> None:
         self._actor = copy.deepcopy(actor).requires_grad_(False).share_memory()
         obs = env.observation_spec["observation"].zero().numpy()
         shared = {k: torch.from_numpy(x).share_memory_() for k, x in allocate(steps, obs, outputs).items()}
         self._arrays: Arrays = {key: tensor.numpy() for key, tensor in shared.items()}
         context = mp.get_context("spawn")
-        bounds = [round(i * env.num_envs / env.workers) for i in range(env.workers + 1)]
+        self._bounds = list(bounds or shares(env))
         self._pipes: list[Connection] = []
         processes = []
-        for first, end in pairwise(bounds):
+        for first, end in pairwise(self._bounds):
             ours, theirs = context.Pipe()
             share = _Share(
                 cloudpickle.dumps(env.make_env), first, end - first, env.num_envs, env.seed, env.action_spec,
@@ -56,20 +66,27 @@ class Workers:
             theirs.close()
             self._pipes.append(ours)
             processes.append(process)
-        self._bounds = bounds
         self.close = weakref.finalize(self, _stop, self._pipes, processes)
-        self._ask([None] * env.workers)  # the processes are up
+        self._answers()  # the processes are up
 
-    def collect(self, actor: TensorDictModuleBase, seed: int, random: bool = False) -> Arrays:
-        """Collects one rollout with the actor's present weights; arrays ``[T, N, ...]``, the caller's to keep."""
+    def begin(self, weights: Iterable[Tensor], seed: int, random: bool = False) -> None:
+        """Starts a rollout with these weights, the values of the actor's ``state_dict()``."""
         with torch.no_grad():
-            for mine, theirs in zip(self._actor.state_dict().values(), actor.state_dict().values(), strict=True):
+            for mine, theirs in zip(self._actor.state_dict().values(), weights, strict=True):
                 mine.copy_(theirs)
-        self._ask([("collect", (seed, random))] * len(self._pipes))
-        return {key: array.copy() for key, array in self._arrays.items()}
+        self._send([("collect", (seed, random))] * len(self._pipes))
+
+    def ready(self) -> bool:
+        """Whether :meth:`finish` would not wait."""
+        return all(pipe.poll() for pipe in self._pipes)
+
+    def finish(self) -> Arrays:
+        """The rollout's arrays ``[T, N, ...]`` of this object's environments, the caller's to keep."""
+        self._answers()
+        return {key: array[:, self._bounds[0] : self._bounds[-1]].copy() for key, array in self._arrays.items()}
 
     def state_dict(self) -> dict[str, Any]:
-        """The environments' state, as :class:`~pgkit.envs.ArrayEnv` would give it for all of them."""
+        """The environments' state, as one :class:`~pgkit.envs.ArrayEnv` would give it."""
         parts = self._ask([("state", None)] * len(self._pipes))
         history = [x for part in parts for x in part["history"]]
         episode = [x for part in parts for x in part["episode"]]
@@ -77,15 +94,21 @@ class Workers:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Gives every process its share of :meth:`state_dict`."""
-        cuts = [slice(a, b) for a, b in pairwise(self._bounds)]
+        start = self._bounds[0]
+        cuts = [slice(a - start, b - start) for a, b in pairwise(self._bounds)]
         parts = [{**state, "episode": state["episode"][c], "history": state["history"][c]} for c in cuts]
         self._ask([("load", part) for part in parts])
 
     def _ask(self, requests: list[Any]) -> list[Any]:
-        """Sends each process its request (None: none) and waits for all answers."""
+        self._send(requests)
+        return self._answers()
+
+    def _send(self, requests: list[Any]) -> None:
         for pipe, request in zip(self._pipes, requests, strict=True):
-            if request is not None:
-                pipe.send(request)
+            pipe.send(request)
+
+    def _answers(self) -> list[Any]:
+        """Waits for every process's answer."""
         answers = []
         for i, pipe in enumerate(self._pipes):
             try:
@@ -97,6 +120,11 @@ class Workers:
                 raise RuntimeError(f"collector worker {i} failed:\n{failure}")
             answers.append(answer)
         return answers
+
+
+def shares(env: VectorEnv) -> list[int]:
+    """Where each worker's environments begin, and the end."""
+    return [round(i * env.num_envs / env.workers) for i in range(env.workers + 1)]
 
 
 class _Share(NamedTuple):
