@@ -1,6 +1,7 @@
 """Collectors: iterables of rollouts."""
 
+from pgkit.collectors.asynchronous import AsyncCollector
 from pgkit.collectors.torchrl import TorchRLCollector
 from pgkit.collectors.vector import VectorCollector
 
-__all__ = ["TorchRLCollector", "VectorCollector"]
+__all__ = ["AsyncCollector", "TorchRLCollector", "VectorCollector"]

@@ -53,7 +53,7 @@ class Workers:
         self._arrays: Arrays = {key: tensor.numpy() for key, tensor in shared.items()}
         context = mp.get_context("spawn")
         self._bounds = list(bounds or shares(env))
-        self._pipes: list[Connection] = []
+        self.pipes: list[Connection] = []
         processes = []
         for first, end in pairwise(self._bounds):
             ours, theirs = context.Pipe()
@@ -64,9 +64,9 @@ class Workers:
             process = context.Process(target=_serve, args=(theirs, share), daemon=True)
             process.start()
             theirs.close()
-            self._pipes.append(ours)
+            self.pipes.append(ours)
             processes.append(process)
-        self.close = weakref.finalize(self, _stop, self._pipes, processes)
+        self.close = weakref.finalize(self, _stop, self.pipes, processes)
         self._answers()  # the processes are up
 
     def begin(self, weights: Iterable[Tensor], seed: int, random: bool = False) -> None:
@@ -74,11 +74,11 @@ class Workers:
         with torch.no_grad():
             for mine, theirs in zip(self._actor.state_dict().values(), weights, strict=True):
                 mine.copy_(theirs)
-        self._send([("collect", (seed, random))] * len(self._pipes))
+        self._send([("collect", (seed, random))] * len(self.pipes))
 
     def ready(self) -> bool:
         """Whether :meth:`finish` would not wait."""
-        return all(pipe.poll() for pipe in self._pipes)
+        return all(pipe.poll() for pipe in self.pipes)
 
     def finish(self) -> Arrays:
         """The rollout's arrays ``[T, N, ...]`` of this object's environments, the caller's to keep."""
@@ -87,7 +87,7 @@ class Workers:
 
     def state_dict(self) -> dict[str, Any]:
         """The environments' state, as one :class:`~pgkit.envs.ArrayEnv` would give it."""
-        parts = self._ask([("state", None)] * len(self._pipes))
+        parts = self._ask([("state", None)] * len(self.pipes))
         history = [x for part in parts for x in part["history"]]
         episode = [x for part in parts for x in part["episode"]]
         return {"seed": parts[0]["seed"], "episode": episode, "history": history}
@@ -104,13 +104,13 @@ class Workers:
         return self._answers()
 
     def _send(self, requests: list[Any]) -> None:
-        for pipe, request in zip(self._pipes, requests, strict=True):
+        for pipe, request in zip(self.pipes, requests, strict=True):
             pipe.send(request)
 
     def _answers(self) -> list[Any]:
         """Waits for every process's answer."""
         answers = []
-        for i, pipe in enumerate(self._pipes):
+        for i, pipe in enumerate(self.pipes):
             try:
                 answer, failure = pipe.recv()
             except EOFError:
