@@ -1,18 +1,36 @@
 """Networks, actors, value operators and normalizers: TensorDict modules and their builders."""
 
-from pgkit.modules.actors import categorical_actor, gaussian_actor, tanh_normal_actor
+from pgkit.modules.actors import actor, gaussian_actor, tanh_normal_actor
+from pgkit.modules.bodies import Encoder, batch_renorm_mlp, ensemble_mlp, simba
+from pgkit.modules.deterministic import deterministic_actor
+from pgkit.modules.discrete import categorical_actor
+from pgkit.modules.encoders import dict_encoder
+from pgkit.modules.ensemble import EnsembleBatchRenorm, EnsembleLayerNorm, EnsembleLinear
+from pgkit.modules.exploration import GaussianExploration
 from pgkit.modules.mlp import mlp
 from pgkit.modules.normalizers import ObsNormalizer, ReturnScale
-from pgkit.modules.q_values import q_value
+from pgkit.modules.q_values import QValue, q_value
 from pgkit.modules.values import state_value
 
 __all__ = [
+    "Encoder",
+    "EnsembleBatchRenorm",
+    "EnsembleLayerNorm",
+    "EnsembleLinear",
+    "GaussianExploration",
     "ObsNormalizer",
+    "QValue",
     "ReturnScale",
+    "actor",
+    "batch_renorm_mlp",
     "categorical_actor",
+    "deterministic_actor",
+    "dict_encoder",
+    "ensemble_mlp",
     "gaussian_actor",
     "mlp",
     "q_value",
+    "simba",
     "state_value",
     "tanh_normal_actor",
 ]

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from math import prod
 from typing import Any
 
 import torch
 from tensordict.nn import InteractionType, TensorDictModule
 from torch import Tensor, nn
-from torch.distributions import Categorical
+from torch.distributions import Distribution
 from torchrl.envs import EnvBase
-from torchrl.modules import IndependentNormal, OneHotCategorical, ProbabilisticActor, TanhNormal
+from torchrl.modules import IndependentNormal, ProbabilisticActor, TanhNormal
 
-from pgkit.errors import UserError
 from pgkit.modules.mlp import orthogonal
 from pgkit.modules.sizes import action_size, box_action
-from pgkit.modules.trunk import trunk
+from pgkit.modules.trunk import headed, trunk
 
 
 def gaussian_actor(
@@ -37,12 +37,13 @@ def gaussian_actor(
         activation: class of the activation.
         log_std: initial log standard deviation (-0.5 explores less than CleanRL's 0 and learns faster on MuJoCo).
         normalizer: applied to the observation first, e.g. :class:`~pgkit.modules.ObsNormalizer`.
-        encoder: replaces the hidden layers; its output feeds the head. Give the same one to
-            :func:`~pgkit.modules.state_value` to share it.
+        encoder: replaces the hidden layers; its output feeds the head. It is called with the observation, or with the
+            entries that its attribute ``in_keys`` names (:func:`~pgkit.modules.dict_encoder`). Give the same one
+            to :func:`~pgkit.modules.state_value` to share it.
     """
     layers, features = trunk(env, hidden, activation, normalizer, encoder)
     head = GaussianHead(features, action_size(env), log_std)
-    return _actor(nn.Sequential(*layers, head), ["loc", "scale"], IndependentNormal, env)
+    return probabilistic(headed(layers, head, ["loc", "scale"]), ["loc", "scale"], IndependentNormal)
 
 
 def tanh_normal_actor(
@@ -71,32 +72,36 @@ def tanh_normal_actor(
     layers, features = trunk(env, hidden, activation, normalizer, encoder)
     head = StateDependentHead(features, action_size(env), log_std_bounds)
     kwargs = {"low": space.low, "high": space.high, "tanh_loc": tanh_loc, "event_dims": 1}
-    return _actor(nn.Sequential(*layers, head), ["loc", "scale"], TanhNormal, env, kwargs)
+    return probabilistic(headed(layers, head, ["loc", "scale"]), ["loc", "scale"], TanhNormal, kwargs)
 
 
-def categorical_actor(
+def actor(
     env: EnvBase,
+    distribution: Callable[..., Distribution],
+    parameters: Sequence[str] | Mapping[str, Sequence[int]] = ("loc", "scale"),
     hidden: Sequence[int] = (64, 64),
     activation: type[nn.Module] = nn.Tanh,
     *,
+    distribution_kwargs: Mapping[str, Any] | None = None,
     normalizer: nn.Module | None = None,
     encoder: nn.Module | None = None,
 ) -> ProbabilisticActor:
-    """A categorical distribution over discrete actions.
+    """An actor with any distribution over a continuous action, whose parameters are raw outputs of one linear head.
 
-    The action is an index where the spec is TorchRL's ``Categorical`` (pgkit's environments), one-hot where it is
-    ``OneHot`` (TorchRL's ``GymEnv`` by default). Arguments as in :func:`gaussian_actor`.
+    Args:
+        env: any TorchRL environment with a continuous action.
+        distribution: called as ``distribution(**parameters, **distribution_kwargs)``; its event is one action,
+            ``[actions]``. It brings raw numbers into the range it needs, and has ``deterministic_sample``, or a
+            mean, for evaluation.
+        parameters: names, each of the action's size; or a mapping from names to shapes of one state's parameters.
+        distribution_kwargs: settings that do not depend on the state.
+        hidden, activation, normalizer, encoder: as in :func:`gaussian_actor`.
     """
-    spec: Any = env.action_spec_unbatched
-    if spec.dtype.is_floating_point or not hasattr(spec.space, "n"):
-        raise UserError(
-            f"categorical_actor needs a discrete action, the environment's is {spec.__class__.__name__}: "
-            "use modules.gaussian_actor or modules.tanh_normal_actor"
-        )
+    size = action_size(env)
+    shapes = parameters if isinstance(parameters, Mapping) else {name: (size,) for name in parameters}
     layers, features = trunk(env, hidden, activation, normalizer, encoder)
-    head = orthogonal(nn.Linear(features, spec.space.n), 0.01)
-    distribution = OneHotCategorical if spec.shape else Categorical
-    return _actor(nn.Sequential(*layers, head), ["logits"], distribution, env)
+    net = headed(layers, SplitHead(features, list(shapes.values())), list(shapes))
+    return probabilistic(net, list(shapes), distribution, dict(distribution_kwargs or {}))
 
 
 class GaussianHead(nn.Module):
@@ -125,16 +130,29 @@ class StateDependentHead(nn.Module):
         return loc, (self.low + 0.5 * (self.high - self.low) * (raw.tanh() + 1)).exp()
 
 
-def _actor(
-    net: nn.Module,
-    parameters: list[str],
-    distribution: type,
-    env: EnvBase,
+class SplitHead(nn.Module):
+    """One linear layer whose output is cut into several: ``[*B, features] -> [*B, *shape]`` for each shape."""
+
+    def __init__(self, features: int, shapes: Sequence[Sequence[int]]) -> None:
+        super().__init__()
+        self.shapes = [tuple(shape) for shape in shapes]
+        self.linear = orthogonal(nn.Linear(features, sum(map(prod, self.shapes))), 0.01)
+
+    def forward(self, x: Tensor) -> tuple[Tensor, ...]:
+        parts = self.linear(x).split([prod(shape) for shape in self.shapes], -1)
+        return tuple(part.unflatten(-1, shape) for part, shape in zip(parts, self.shapes, strict=True))
+
+
+def probabilistic(
+    net: TensorDictModule,
+    parameters: Sequence[str],
+    distribution: Callable[..., Distribution],
     kwargs: dict[str, Any] | None = None,
 ) -> ProbabilisticActor:
+    """TorchRL's ``ProbabilisticActor`` of a network that writes the distribution's parameters."""
     return ProbabilisticActor(
-        TensorDictModule(net, in_keys=["observation"], out_keys=parameters),
-        in_keys=parameters,
+        net,
+        in_keys=[*parameters],
         distribution_class=distribution,
         distribution_kwargs=kwargs or {},
         return_log_prob=True,

@@ -5,17 +5,21 @@ from __future__ import annotations
 from math import prod
 
 import torch
+from tensordict.utils import NestedKey
 from torchrl.data import Bounded, TensorSpec
 from torchrl.envs import EnvBase
 
 from pgkit.errors import UserError
 
 
-def observation_shape(env: EnvBase, key: str = "observation") -> torch.Size:
+def observation_shape(env: EnvBase, key: NestedKey = "observation") -> torch.Size:
     """Shape of one observation, without the environment's batch dimensions."""
     spec = env.observation_spec_unbatched
-    if key not in spec.keys():
-        raise UserError(f"the environment has no observation '{key}', only {', '.join(map(str, spec.keys()))}")
+    if key not in spec.keys(True):
+        raise UserError(
+            f"the environment has no observation '{key}', only {', '.join(map(str, spec.keys()))}: pass encoder="
+            "modules.dict_encoder({name: module}) with those names"
+        )
     return spec[key].shape
 
 

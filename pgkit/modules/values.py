@@ -9,7 +9,7 @@ from torchrl.envs import EnvBase
 from torchrl.modules import ValueOperator
 
 from pgkit.modules.mlp import orthogonal
-from pgkit.modules.trunk import trunk
+from pgkit.modules.trunk import headed, trunk
 
 
 def state_value(
@@ -27,4 +27,5 @@ def state_value(
     """
     layers, features = trunk(env, hidden, activation, normalizer, encoder)
     head = orthogonal(nn.Linear(features, 1), 1.0)
-    return ValueOperator(nn.Sequential(*layers, head), in_keys=["observation"])
+    net = headed(layers, head, ["state_value"])
+    return ValueOperator(net.module, in_keys=net.in_keys)

@@ -2,6 +2,7 @@
 
 from pgkit.updates.off_policy import OffPolicyUpdate
 from pgkit.updates.on_policy import OnPolicyUpdate
+from pgkit.updates.optimizers import Together
 from pgkit.updates.step import GradientStep
 
-__all__ = ["GradientStep", "OffPolicyUpdate", "OnPolicyUpdate"]
+__all__ = ["GradientStep", "OffPolicyUpdate", "OnPolicyUpdate", "Together"]

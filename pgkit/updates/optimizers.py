@@ -21,6 +21,46 @@ from torch.optim.sgd import sgd
 Apply = Callable[[list[Tensor]], None]
 
 
+class Together:
+    """Several optimizers as one: Muon for the matrices and Adam for the rest, say.
+
+    Args:
+        *parts: optimizers, each over parameters of its own.
+    """
+
+    def __init__(self, *parts: Optimizer) -> None:
+        self.parts = parts
+
+    @property
+    def param_groups(self) -> list[dict[str, Any]]:
+        """The groups of all parts."""
+        return [group for part in self.parts for group in part.param_groups]
+
+    @property
+    def state(self) -> dict[Tensor, Any]:
+        """The state of every parameter."""
+        return {p: state for part in self.parts for p, state in part.state.items()}
+
+    def zero_grad(self, set_to_none: bool = True) -> None:
+        """Of all parts."""
+        for part in self.parts:
+            part.zero_grad(set_to_none)
+
+    def step(self) -> None:
+        """Of all parts."""
+        for part in self.parts:
+            part.step()
+
+    def state_dict(self) -> dict[str, Any]:
+        """The parts' own."""
+        return {"parts": [part.state_dict() for part in self.parts]}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restores :meth:`state_dict`."""
+        for part, own in zip(self.parts, state["parts"], strict=True):
+            part.load_state_dict(own)
+
+
 def parameters(optimizer: Optimizer) -> list[Tensor]:
     """All parameters of the optimizer, in the order of its groups."""
     return [p for group in optimizer.param_groups for p in group["params"]]

@@ -1,0 +1,78 @@
+"""Actors over discrete actions: one choice, several at once, masked or not."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+from torch.distributions import Categorical, Independent
+from torchrl.data import MultiCategorical as MultiCategoricalSpec
+from torchrl.envs import EnvBase
+from torchrl.modules import OneHotCategorical, ProbabilisticActor
+
+from pgkit.errors import UserError
+from pgkit.modules.actors import probabilistic
+from pgkit.modules.mlp import orthogonal
+from pgkit.modules.trunk import headed, trunk
+
+
+def categorical_actor(
+    env: EnvBase,
+    hidden: Sequence[int] = (64, 64),
+    activation: type[nn.Module] = nn.Tanh,
+    *,
+    normalizer: nn.Module | None = None,
+    encoder: nn.Module | None = None,
+) -> ProbabilisticActor:
+    """A categorical distribution over discrete actions; over MultiDiscrete ones, the product of one for each choice.
+
+    The action is an index where the spec is TorchRL's ``Categorical`` (pgkit's environments), one-hot where it is
+    ``OneHot`` (TorchRL's ``GymEnv`` by default). Where the environment observes an ``action_mask`` (boolean
+    ``[n]``, for MultiDiscrete the masks of all choices side by side), actions that it forbids have probability 0, and
+    their logits no gradient. Arguments as in :func:`gaussian_actor`.
+    """
+    spec = env.action_spec_unbatched
+    several = isinstance(spec, MultiCategoricalSpec)
+    if spec.dtype.is_floating_point or not (several or hasattr(spec.space, "n")):
+        raise UserError(
+            f"categorical_actor needs a discrete action, the environment's is {spec.__class__.__name__}: "
+            "use modules.gaussian_actor or modules.tanh_normal_actor"
+        )
+    choices = [int(n) for n in spec.nvec.flatten()] if several else [int(spec.space.n)]
+    layers, features = trunk(env, hidden, activation, normalizer, encoder)
+    head = orthogonal(nn.Linear(features, sum(choices)), 0.01)
+    if "action_mask" in env.observation_spec.keys():
+        net = headed(layers, MaskedHead(head), ["logits"], ["action_mask"])
+    else:
+        net = headed(layers, head, ["logits"])
+    if several:
+        return probabilistic(net, ["logits"], MultiCategorical, {"choices": choices})
+    return probabilistic(net, ["logits"], OneHotCategorical if spec.shape else Categorical)
+
+
+class MaskedHead(nn.Module):
+    """Logits ``[*B, n]`` of features and a boolean mask ``[*B, n]``: the least number there is where it is False."""
+
+    def __init__(self, head: nn.Module) -> None:
+        super().__init__()
+        self.head = head
+
+    def forward(self, x: Tensor, mask: Tensor) -> Tensor:
+        logits = self.head(x)
+        return logits.masked_fill(~mask, torch.finfo(logits.dtype).min)
+
+
+class MultiCategorical(Independent):
+    """Independent choices: ``logits [*B, sum(choices)]``, actions ``[*B, len(choices)]``, log-probability ``[*B]``."""
+
+    def __init__(self, logits: Tensor, choices: Sequence[int]) -> None:
+        least, most = torch.finfo(logits.dtype).min, max(choices)
+        parts = [F.pad(x, (0, most - x.shape[-1]), value=least) for x in logits.split(list(choices), -1)]
+        super().__init__(Categorical(logits=torch.stack(parts, -2)), 1)
+
+    @property
+    def deterministic_sample(self) -> Tensor:
+        """The likeliest of each choice."""
+        return self.mode
