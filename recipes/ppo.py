@@ -75,6 +75,7 @@ PRESETS = {
         gamma=0.95, log_std=0.5, normalize_advantage="minibatch",
     ),
     "HalfCheetah-*": dict(lmbda=0.9),
+    "Hopper-*": dict(learning_rate=2e-4, anneal=True),
     "dm_control/*": dict(),
     "dmc:*": dict(),
 }  # fmt: skip

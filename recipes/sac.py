@@ -13,7 +13,6 @@ import torch
 from torchrl.data import LazyMemmapStorage, LazyTensorStorage
 
 from pgkit import collectors, controllers, data, envs, losses, modules, run, updates
-from pgkit.run.metrics import finished_episodes
 
 
 @dataclass
@@ -32,6 +31,8 @@ class Args(run.RunArgs):
     """Simulator steps for each action."""
     steps: int = 1
     """Steps each env takes between updates."""
+    asynchronous: bool = False
+    """Collect in another process while this one updates: rollouts are one update old, see train/policy_lag."""
     random_frames: int = 1_000
     """Frames with random actions at the start; updates begin after them."""
     batch_size: int = 256
@@ -119,7 +120,8 @@ def main(args: Args) -> None:
             total_frames=args.total_frames,
             compile=args.compile,
         )
-        collector = collectors.VectorCollector(
+        make_collector = collectors.AsyncCollector if args.asynchronous else collectors.VectorCollector
+        collector = make_collector(
             env,
             actor,
             frames_per_batch=args.num_envs * args.steps,
@@ -130,14 +132,12 @@ def main(args: Args) -> None:
 
         replay = data.BesideCheckpoint(buffer, log.dir / "checkpoints" / "buffer.pt", save=args.save_buffer)
         log.track(policy=actor, eval_env=make_env, update=update, collector=collector, replay=replay)
-        metrics, episodes, logged = {}, [], collector.frames
         for rollout in collector:
-            metrics = update(rollout) or metrics
-            episodes += finished_episodes(rollout)
-            if collector.frames // args.log_every > logged // args.log_every or collector.frames >= args.total_frames:
-                compile_seconds = update.compile_seconds + collector.compile_seconds
-                log.step(collector.frames, None, metrics, compile_seconds=compile_seconds, episodes=episodes)
-                episodes, logged = [], collector.frames
+            metrics = update(rollout)
+            if args.asynchronous:
+                metrics["policy_lag"] = collector.lag
+            compile_seconds = update.compile_seconds + collector.compile_seconds
+            log.step(collector.frames, rollout, metrics, compile_seconds=compile_seconds, every=args.log_every)
         collector.shutdown()
 
 

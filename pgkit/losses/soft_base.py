@@ -7,12 +7,15 @@ from math import log
 from typing import Any, ClassVar
 
 import torch
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
+from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.data import TensorSpec
 
 from pgkit.errors import UserError
-from pgkit.functional import temperature_loss
+from pgkit.functional import ensemble_mean, random_subset, temperature_loss, twin_minimum
+from pgkit.heads import Head, Scalar
 from pgkit.losses.q_base import QLoss
 
 
@@ -28,11 +31,14 @@ class SoftQLoss(QLoss):
         fixed_alpha: do not train it.
         target_entropy: :math:`\bar H`; ``auto`` is minus the number of action dimensions.
         action_spec: spec of one action; names the dimensions before the first batch does.
-        loss_function: ``l2``, ``l1`` or ``smooth_l1``.
-        num_qvalue_nets, gamma, delay_actor, delay_qvalue, separate_losses, reduction: as in ``QLoss``.
+        loss_function: distance of scalar critics: ``l2``, ``l1`` or ``smooth_l1``.
+        subset: so many critics, drawn anew at every call, make the target (REDQ's M); None: all.
+        actor_value: the actor maximizes the ``min`` or the ``mean`` of the critics.
+        num_qvalue_nets, gamma, delay_actor, delay_qvalue, separate_losses, reduction, head: as in ``QLoss``.
 
     Raises:
-        UserError: the actor is discrete and the loss is not (``takes_discrete``).
+        UserError: the actor is discrete and the loss is not (``takes_discrete``); ``subset`` is above the number of
+            critics.
     """
 
     takes_discrete: ClassVar[bool] = False
@@ -52,19 +58,27 @@ class SoftQLoss(QLoss):
         target_entropy: str | float = "auto",
         action_spec: TensorSpec | None = None,
         loss_function: str = "l2",
+        subset: int | None = None,
+        actor_value: str = "min",
         num_qvalue_nets: int = 2,
         gamma: float = 0.99,
         delay_actor: bool = False,
         delay_qvalue: bool = True,
         separate_losses: bool = False,
         reduction: str | None = None,
+        head: Head | None = None,
     ) -> None:
         if not self.takes_discrete:
             _refuse_discrete(type(self).__name__, actor_network)
         super().__init__(
             actor_network, qvalue_network, num_qvalue_nets=num_qvalue_nets, gamma=gamma, delay_actor=delay_actor,
-            delay_qvalue=delay_qvalue, separate_losses=separate_losses, reduction=reduction,
+            delay_qvalue=delay_qvalue, separate_losses=separate_losses, reduction=reduction, head=head,
         )  # fmt: skip
+        if isinstance(self.head, Scalar):
+            self.head = Scalar(loss_function)
+        if subset is not None and not 1 <= subset <= self.num_critics:
+            raise UserError(f"subset={subset} of {self.num_critics} critics: give a number from 1 to the latter")
+        self.subset, self.actor_value = subset, {"min": twin_minimum, "mean": ensemble_mean}[actor_value]
         self.temperature: Any = temperature
         if temperature is None:
             log_alpha = torch.tensor(log(alpha_init))
@@ -82,7 +96,7 @@ class SoftQLoss(QLoss):
     def alpha(self) -> Tensor:
         r"""The temperature :math:`\alpha`, a detached scalar."""
         if self.temperature is not None:
-            return self.temperature.alpha
+            return self.temperature.alpha.clone()  # a controller may move it while the loss is computed
         with torch.no_grad():
             bounded = self._log_bounds != (None, None)
             return (self.log_alpha.clamp_(*self._log_bounds) if bounded else self.log_alpha).exp()
@@ -96,6 +110,10 @@ class SoftQLoss(QLoss):
             raise AttributeError("target_entropy='auto' is read off the first batch of actions: none was seen yet")
         return self._target_entropy
 
+    def draw(self) -> Tensor | None:
+        """The critics that make this call's target, ``[subset]``; None: all."""
+        return None if self.subset is None else random_subset(self.num_critics, self.subset, self.gamma.device)
+
     def temperature_loss(self, action: Tensor, log_prob: Tensor) -> Tensor:
         """Unreduced ``[*B]`` loss of the temperature at actions ``[*B, actions]`` drawn now, ``log_prob [*B]``."""
         log_prob = log_prob.detach()
@@ -104,6 +122,23 @@ class SoftQLoss(QLoss):
         if self._target_entropy is None:
             self._target_entropy = -action.numel() / log_prob.numel()
         return temperature_loss(self.log_alpha, log_prob, self._target_entropy)
+
+    def result(
+        self, batch: TensorDictBase, actor: Tensor, qvalue: Tensor, action: Tensor, log_prob: Tensor, q: Tensor
+    ) -> TensorDict:
+        """The three losses of the unreduced ``[*B]``, and the metrics; ``log_prob [*B]`` is that of ``action``."""
+        out = TensorDict(
+            {
+                "loss_actor": self.reduce(actor, batch),
+                "loss_qvalue": self.reduce(qvalue, batch),
+                "loss_alpha": self.reduce(self.temperature_loss(action, log_prob), batch),
+            }
+        )
+        out["alpha"], out["entropy"], out["q_value"] = self.alpha, -log_prob.detach().mean(), q.detach().mean()
+        return out
+
+    def _writes(self) -> list[NestedKey]:
+        return ["loss_actor", "loss_qvalue", "loss_alpha", "alpha", "entropy", "q_value"]
 
 
 def _refuse_discrete(loss: str, actor: TensorDictModule) -> None:

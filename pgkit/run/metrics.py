@@ -3,8 +3,9 @@
 import csv
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 from tensordict import TensorDictBase
@@ -73,11 +74,17 @@ def finished_episodes(rollout: TensorDictBase | None) -> list[tuple[float, int]]
 
     A rollout without TorchRL's ``episode_reward`` and ``step_count`` entries has none.
     """
-    if rollout is None or ("next", "episode_reward") not in rollout.keys(include_nested=True):
+    if rollout is None or not (done := rollout["next", "done"]).any() or "episode_reward" not in rollout["next"].keys():
         return []
-    done = rollout["next", "done"].squeeze(-1).T
+    done = done.squeeze(-1).T
     rewards, lengths = (rollout["next", name].squeeze(-1).T[done] for name in ("episode_reward", "step_count"))
     return list(zip(rewards.tolist(), lengths.tolist(), strict=True))
+
+
+def averages(rows: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """The mean of every name over the rows that have it."""
+    names = dict.fromkeys(name for row in rows for name in row)
+    return {name: fmean(float(row[name]) for row in rows if name in row) for name in names}
 
 
 def warm(fps: list[float]) -> list[float]:

@@ -4,7 +4,7 @@ import shlex
 import signal
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from statistics import mean, median
 from types import FrameType
 from typing import Any
@@ -16,7 +16,7 @@ from pgkit.errors import UserError
 from pgkit.run import checkpoint, directory, seeding
 from pgkit.run.clock import Clock
 from pgkit.run.evaluate import evaluate
-from pgkit.run.metrics import Metrics, column, finished_episodes, read_csv, warm
+from pgkit.run.metrics import Metrics, averages, column, finished_episodes, read_csv, warm
 from pgkit.run.plots import plot
 from pgkit.run.policy import describe_env
 from pgkit.run.progress import Live
@@ -46,6 +46,7 @@ class Run:
         self.best: dict[str, float] = counters.get("best", {})
         self._evaluated: dict[str, float] = counters.get("evaluated", {})
         self._episodes = deque[tuple[float, int]](counters.get("episodes", ()), maxlen=100)
+        self._recent: list[Mapping[str, float]] = []  # metrics since the last row
         self._clock = Clock(already=counters.get("wall_s", 0.0))
         self._tracked: dict[str, checkpoint.Stateful] = {}
         self._eval: Any = None
@@ -95,22 +96,24 @@ class Run:
         rollout: TensorDictBase | None = None,
         metrics: Mapping[str, float] | None = None,
         compile_seconds: float = 0.0,
-        episodes: Iterable[tuple[float, int]] = (),
+        every: int = 1,
     ) -> None:
-        """Log one update as a row of ``metrics.csv``; evaluate and save when due.
+        """Log one update in ``metrics.csv``; evaluate and save when due.
 
         Args:
             frames: env steps taken so far, all envs together.
             rollout: ``[num_envs, T]``; its finished episodes enter the mean of the last 100.
             metrics: logged as ``train/<name>``, or as they are if the name holds a ``/``.
             compile_seconds: seconds this process has spent compiling so far; left out of ``time/fps``.
-            episodes: finished episodes as ``(return, length)``, for a recipe without such rollouts.
+            every: a row only every so many frames, with the means of the metrics since the last one.
         """
         if not self._tracked:
             raise RuntimeError("call track(policy=..., eval_env=...) before the first step(...)")
         self._episodes.extend(finished_episodes(rollout))
-        self._episodes.extend(episodes)
+        self._recent += [metrics] if metrics else []
         due = frames >= self.args.total_frames
+        if not (due or self._interrupted or frames // every > self.frames // every):
+            return
         if self.args.eval_every:
             due |= frames // self.args.eval_every > self.frames // self.args.eval_every
         self.frames = frames
@@ -121,7 +124,8 @@ class Run:
             "rollout/ep_rew_mean": mean(reward for reward, _ in self._episodes) if self._episodes else NAN,
             "rollout/ep_len_mean": mean(length for _, length in self._episodes) if self._episodes else NAN,
         }
-        row |= {name if "/" in name else f"train/{name}": float(value) for name, value in (metrics or {}).items()}
+        row |= {name if "/" in name else f"train/{name}": value for name, value in averages(self._recent).items()}
+        self._recent = []
         self._live.update(frames, row["rollout/ep_rew_mean"], row["time/fps"])
         if due:
             row |= self._evaluate(row)

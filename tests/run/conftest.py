@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.data import Bounded, Composite, Unbounded
 
@@ -75,7 +76,15 @@ def linear_policy(weight: float = 0.0) -> TensorDictModule:
     return TensorDictModule(linear, in_keys=["observation"], out_keys=["action"])
 
 
-def train(args: RunArgs, recipe: str = "walk", hook: Callable[[int], None] | None = None, **extra: Any) -> run.Run:
+def ended(frames: int) -> TensorDict:
+    """One episode that ended, of return ``frames`` and length 5."""
+    following = {"episode_reward": torch.full((1, 1, 1), float(frames)), "step_count": torch.full((1, 1, 1), 5)}
+    return TensorDict({"next": {**following, "done": torch.ones(1, 1, 1, dtype=torch.bool)}}, [1, 1])
+
+
+def train(
+    args: RunArgs, recipe: str = "walk", hook: Callable[[int], None] | None = None, every: int = 1, **extra: Any
+) -> run.Run:
     """Ten frames a step; the one metric is drawn from the global generator, so it shows where that stands."""
     with run.Run(args, recipe) as log:
         counter = Counter()
@@ -83,7 +92,7 @@ def train(args: RunArgs, recipe: str = "walk", hook: Callable[[int], None] | Non
         while counter.frames < args.total_frames:
             counter.frames += 10
             drawn = {"draw": torch.rand(()).item() + np.random.rand()}
-            log.step(counter.frames, None, drawn, episodes=[(float(counter.frames), 5)])
+            log.step(counter.frames, ended(counter.frames), drawn, every=every)
             if hook:
                 hook(counter.frames)
     return log

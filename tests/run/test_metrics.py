@@ -5,7 +5,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
-from pgkit.run.metrics import Metrics, column, finished_episodes, read_csv
+from pgkit.run.metrics import Metrics, averages, column, finished_episodes, read_csv
 
 
 def write(run_dir: Path, *rows: dict[str, float], upto: int = 0) -> Path:
@@ -57,3 +57,8 @@ def test_finished_episodes_are_those_where_done_oldest_first():
     following = {name: value.unsqueeze(-1) for name, value in entries.items()}
     assert finished_episodes(TensorDict({"next": following}, [2, 3])) == [(10.0, 8), (3.0, 3)]
     assert finished_episodes(TensorDict({"next": {"done": done.unsqueeze(-1)}}, [2, 3])) == []
+
+
+def test_averages_are_over_the_rows_that_have_the_name():
+    assert averages([{"a": 1.0, "b": 4.0}, {"a": 2.0}]) == {"a": 1.5, "b": 4.0}
+    assert averages([]) == {}

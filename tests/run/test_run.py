@@ -52,6 +52,15 @@ def test_the_same_seed_gives_the_same_metrics_and_another_does_not(kit: SimpleNa
     assert rows(tmp_path / "a") == rows(tmp_path / "b") != rows(tmp_path / "c")
 
 
+def test_a_row_every_so_many_frames_has_the_means_since_the_last(kit: SimpleNamespace, tmp_path: Path):
+    kit.train(arguments(tmp_path / "all"))
+    kit.train(arguments(tmp_path / "some"), every=20)
+    every = [float(r["train/draw"]) for r in rows(tmp_path / "all")]
+    some = rows(tmp_path / "some")
+    assert [r["frames"] for r in some] == ["20", "40"]
+    assert [float(r["train/draw"]) for r in some] == [sum(every[:2]) / 2, sum(every[2:]) / 2]
+
+
 def test_evaluating_does_not_change_the_training(kit: SimpleNamespace, tmp_path: Path):
     kit.train(arguments(tmp_path / "often"))
     seldom = arguments(tmp_path / "seldom")
