@@ -73,12 +73,17 @@ class Run:
     def track(self, *, policy: torch.nn.Module, eval_env: Callable[..., Any], **stateful: checkpoint.Stateful) -> None:
         """Name what to evaluate and what to save; on a resume, load the checkpoint into it.
 
+        With ``--explain`` it prints the update, which says how the agent is wired, and ends the program.
+
         Args:
             policy: the actor; reads ``observation``, writes ``action``.
             eval_env: picklable; ``eval_env(num_envs=, seed=)`` makes the evaluation's own env.
             stateful: whatever else the run must restore (update, collector, normalizer, ...).
         """
         tracked: dict[str, checkpoint.Stateful] = {"policy": policy, **stateful}
+        if self.args.explain:
+            print(stateful.get("update", policy))
+            raise SystemExit(0)
         resumed_at = []
         if self._saved:
             checkpoint.restore(tracked, self._saved["states"], self.dir / "checkpoints" / "latest.pt")

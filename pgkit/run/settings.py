@@ -42,6 +42,8 @@ class RunArgs:
     """Run directory to go on with: its settings are taken over, other flags given here override them."""
     threads: int = 1
     """Threads that PyTorch uses in this process; 1 is fastest for small networks."""
+    explain: bool = False
+    """Print how the agent is wired (who writes and who reads each entry), and end before training."""
 
 
 A = TypeVar("A", bound=RunArgs)
@@ -53,17 +55,19 @@ def launch(
     args_class: type[A],
     presets: Presets | None = None,
     argv: Sequence[str] | None = None,
+    variants: Presets | None = None,
 ) -> None:
     """Parse the flags and call ``main(args)``: exit 2 and one line on a UserError, 130 on Ctrl-C.
 
     Args:
         presets: env id pattern (as in a shell: ``dm_control/*``) -> settings; the first match is used.
         argv: the flags, without the program's name (default: ``sys.argv[1:]``).
+        variants: name -> settings that the flag ``--variant NAME`` starts from; the preset comes on top.
     """
     logging.basicConfig(format="%(message)s")  # to stderr
     logging.getLogger("pgkit").setLevel(logging.INFO)
     try:
-        main(parse(args_class, presets or {}, sys.argv[1:] if argv is None else argv))
+        main(parse(args_class, presets or {}, sys.argv[1:] if argv is None else argv, variants or {}))
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
@@ -71,26 +75,40 @@ def launch(
         sys.exit(130)
 
 
-def parse(args_class: type[A], presets: Presets, argv: Sequence[str]) -> A:
-    """Settings, each over the one before: dataclass defaults, the env's preset or the resumed run, flags."""
+def parse(args_class: type[A], presets: Presets, argv: Sequence[str], variants: Presets | None = None) -> A:
+    """Settings, each over the one before: dataclass defaults, the variant, the env's preset, flags.
+
+    A resumed run's settings take the place of the first three.
+    """
     import tyro
 
     peek = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     peek.add_argument("--env-id", "--env_id", nargs="?")
     peek.add_argument("--resume", nargs="?", type=Path)
+    if variants:
+        peek.add_argument("--variant", nargs="?")
     given = peek.parse_known_args(argv)[0]
     defaults = args_class()
+    name, variant = _variant(variants or {}, getattr(given, "variant", None))
     if given.resume:
-        pattern, preset = "", _saved_settings(args_class, given.resume)
+        pattern, preset, variant = "", _saved_settings(args_class, given.resume), {}
     else:
         pattern, preset = first_match(presets, given.env_id or defaults.env_id)
-    base = dataclasses.replace(defaults, **preset)
+    base = dataclasses.replace(defaults, **{**variant, **preset})
     args = tyro.cli(args_class, default=base, args=list(argv), prog=_program(), description=main_doc(args_class))
     if given.resume:
         _check_resumed(base, args)
-    elif shown := [f"{name}={value}" for name, value in preset.items() if getattr(args, name) == value]:
-        print(f"preset {pattern}: {' '.join(shown)}")
+    else:
+        for title, chosen in ((f"variant {name}", variant), (f"preset {pattern}", preset)):
+            if shown := [f"{key}={value}" for key, value in chosen.items() if getattr(args, key) == value]:
+                print(f"{title}: {' '.join(shown)}")
     return args
+
+
+def _variant(variants: Presets, name: str | None) -> tuple[str | None, Mapping[str, Any]]:
+    if name and name not in variants:
+        raise UserError(f"--variant {name}: this recipe has {', '.join(variants)}")
+    return name, variants[name] if name else {}
 
 
 def check(args: RunArgs) -> None:

@@ -38,6 +38,10 @@ class Batches(Protocol):
         """Called after each step, outside the graph."""
         ...
 
+    def settings(self) -> dict[str, Any]:
+        """Objects with a ``gamma`` of their own, by name."""
+        ...
+
 
 class OwnBatches:
     """From pgkit's replay: only row numbers are drawn, the rest is in the graph."""
@@ -63,6 +67,9 @@ class OwnBatches:
 
     def drawn(self) -> None:
         pass
+
+    def settings(self) -> dict[str, Any]:
+        return {}
 
 
 class TorchRLBatches:
@@ -97,6 +104,10 @@ class TorchRLBatches:
     def drawn(self) -> None:
         if self.prioritized:
             self.buffer.update_tensordict_priority(self._sample.set(self.priority, self._batch[self.priority]))
+
+    def settings(self) -> dict[str, Any]:
+        transforms = getattr(self.buffer, "_transform", None)
+        return {f"{type(t).__name__} of {type(self.buffer).__name__}": t for t in transforms or ()}
 
 
 def discount(loss: nn.Module) -> Any:

@@ -14,6 +14,8 @@ from pgkit.data import ReplayBuffer
 from pgkit.errors import UserError
 from pgkit.updates import optimizers, wiring
 from pgkit.updates.batches import Batches, OwnBatches, TorchRLBatches
+from pgkit.updates.chain import Chain
+from pgkit.updates.diagram import diagram
 from pgkit.updates.step import GradientStep
 from pgkit.updates.targets import averaging
 
@@ -32,6 +34,7 @@ class OffPolicyUpdate:
         batch_size: rows of a batch.
         updates_per_step: gradient steps for each frame collected; a fraction such as 0.5 adds up.
         actor_delay: the losses other than the critics' join every so many steps (2 in TD3).
+        delay_targets: the target networks move only in the steps in which those other losses join, as in TD3.
         tau: share of the trained parameters that the targets take over at each step.
         learning_starts: frames in the replay before the first step, at least ``batch_size``.
         max_grad_norm: bound of the gradient's norm over all parameters; None: no bound.
@@ -51,6 +54,7 @@ class OffPolicyUpdate:
         batch_size: int = 256,
         updates_per_step: float = 1.0,
         actor_delay: int = 1,
+        delay_targets: bool = False,
         tau: float = 0.005,
         learning_starts: int = 1_000,
         max_grad_norm: float | None = None,
@@ -64,10 +68,12 @@ class OffPolicyUpdate:
             )
         self.loss, self.buffer, self.optimizer = loss, buffer, optimizer
         self.batch_size, self.updates_per_step, self.actor_delay = batch_size, updates_per_step, actor_delay
+        self.delay_targets = delay_targets
         self.tau, self.learning_starts, self.max_grad_norm = tau, learning_starts, max_grad_norm
         self.total_frames, self.compile = total_frames, compile
         self.frames = self.updates = 0
         self._due = 0.0
+        self._batch: TensorDictBase | None = None
         self._average = averaging(loss, tau)
         own = isinstance(buffer, ReplayBuffer)
         self._batches: Batches = (
@@ -105,6 +111,16 @@ class OffPolicyUpdate:
                 metrics |= dict(zip(self._steps[whole].names, means.tolist(), strict=True))
         return metrics
 
+    def __str__(self) -> str:
+        norm = f"gradient norm at most {self.max_grad_norm:g}, " if self.max_grad_norm else ""
+        delay = f"the actor once in {self.actor_delay} steps, " if self.actor_delay > 1 else ""
+        tau = "" if self._average is None else f"targets move by {self.tau:g}, "
+        step = (
+            f"{self.updates_per_step:g} a frame after {self.learning_starts:,} frames, batches of {self.batch_size}, "
+            f"{delay}{tau}{norm}compile {self.compile}"
+        )
+        return diagram(self, Chain(self.loss, None, type(self.buffer).__name__), step, self._batch)
+
     @property
     def compile_seconds(self) -> float:
         """Seconds spent compiling so far."""
@@ -127,7 +143,9 @@ class OffPolicyUpdate:
 
     def _assemble(self, data: TensorDictBase, index: Tensor) -> None:
         batch = self._batches.gather(data, index)
-        names = wiring.check(self.loss, None, self.optimizer, batch)
+        source, owners = type(self.buffer).__name__, self._batches.settings()
+        names = wiring.check(self.loss, None, self.optimizer, batch, source, owners)
+        self._batch = batch
         steps = None if self.total_frames is None else self.total_frames * self.updates_per_step
         settings: dict[str, Any] = {
             "max_grad_norm": self.max_grad_norm,
@@ -142,6 +160,7 @@ class OffPolicyUpdate:
         if self.actor_delay > 1:
             only = self._critics(batch)
             names = [name for name in names if name in only]
+            settings["after"] = None if self.delay_targets else self._average
             self._steps[False] = GradientStep(self.loss, self.optimizer, names, only=only, **settings)
 
     def _critics(self, batch: TensorDictBase) -> dict[str, list[Tensor]]:

@@ -13,6 +13,9 @@ from torch.optim import Optimizer
 from pgkit.compiling import worth_compiling
 from pgkit.errors import UserError
 from pgkit.updates import wiring
+from pgkit.updates.chain import Chain
+from pgkit.updates.diagram import diagram
+from pgkit.updates.sequences import as_rows, check_one_memory
 from pgkit.updates.step import GradientStep
 
 
@@ -26,6 +29,9 @@ class OnPolicyUpdate:
         optimizer: any ``torch.optim`` optimizer over the parameters to train.
         epochs: passes over the rollout.
         minibatch_size: rows of a minibatch; the last of an epoch may be smaller. None: the whole rollout.
+        sequence_length: for recurrent networks: minibatches are whole sequences of so many steps (``minibatch_size``
+            counts steps all the same), and gradients flow back so far. It divides the steps of a rollout. None: single
+            rows.
         max_grad_norm: bound of the gradient's norm; None: no bound.
         recompute_advantage: estimate the advantage again before every epoch (Andrychowicz et al., 2021).
         normalize_advantage: standardize each minibatch's advantage here; for losses that do not do it themselves.
@@ -46,6 +52,7 @@ class OnPolicyUpdate:
         *,
         epochs: int = 10,
         minibatch_size: int | None = 64,
+        sequence_length: int | None = None,
         max_grad_norm: float | None = 0.5,
         recompute_advantage: bool = False,
         normalize_advantage: bool = False,
@@ -61,19 +68,27 @@ class OnPolicyUpdate:
             raise UserError(
                 f"{type(loss).__name__} normalizes the advantage already: leave normalize_advantage out here"
             )
+        if sequence_length and minibatch_size and minibatch_size % sequence_length:
+            raise UserError(
+                f"minibatch_size={minibatch_size} is not a multiple of sequence_length={sequence_length}: a minibatch "
+                "is made of whole sequences"
+            )
         self.loss, self.advantage, self.optimizer = loss, advantage, optimizer
+        self.sequence_length = sequence_length
         self.epochs, self.minibatch_size, self.max_grad_norm = epochs, minibatch_size, max_grad_norm
         self.recompute_advantage, self.normalize_advantage = recompute_advantage, normalize_advantage
         self.target_kl, self.schedules, self.total_frames = target_kl, dict(schedules or {}), total_frames
         self.compile, self.frames = compile, 0
         self._generator = torch.Generator().manual_seed(int(torch.randint(2**62, ())) if seed is None else seed)
         self._step: GradientStep | None = None
+        self._batch: TensorDictBase | None = None
 
     def __call__(self, rollout: TensorDictBase) -> dict[str, float]:
         """Trains on a rollout ``[num_envs, T]`` (or any batch shape); metrics are means over the minibatches."""
         self._follow_schedules()
-        rows = rollout.numel()
-        size = min(self.minibatch_size or rows, rows)
+        length = self.sequence_length or 1
+        rows = rollout.numel() // length
+        size = min((self.minibatch_size or rollout.numel()) // length, rows)
         results: list[Tensor] = []
         flat, epoch = rollout, 0
         for epoch in range(1, self.epochs + 1):
@@ -89,7 +104,7 @@ class OnPolicyUpdate:
                 results.append(self._step(flat, index) if len(index) == size else self._step.eager(flat, index))
             if self.target_kl is not None and self._kl(results[start:]) > 1.5 * self.target_kl:
                 break
-        self.frames += rows
+        self.frames += rollout.numel()
         assert self._step is not None
         means = torch.stack(results).mean(0).tolist()
         metrics = dict(zip(self._step.names, means, strict=True))
@@ -97,6 +112,12 @@ class OnPolicyUpdate:
             "epochs": float(epoch),
             "learning_rate": float(self.optimizer.param_groups[0]["lr"]),
         }
+
+    def __str__(self) -> str:
+        size = self.minibatch_size or "the whole rollout"
+        norm = f"gradient norm at most {self.max_grad_norm:g}, " if self.max_grad_norm else ""
+        step = f"{self.epochs} epochs of minibatches of {size}, {norm}compile {self.compile}"
+        return diagram(self, Chain(self.loss, self.advantage), step, self._batch)
 
     @property
     def compile_seconds(self) -> float:
@@ -127,12 +148,14 @@ class OnPolicyUpdate:
         """The advantage, then the entries that the loss reads as ``[rows, ...]``."""
         if self.advantage is not None:
             self.advantage(rollout)
-        return rollout.select(*wiring.read_keys(self.loss, rollout)).reshape(-1).contiguous()
+        return as_rows(rollout.select(*wiring.read_keys(self.loss, rollout)), self.sequence_length)
 
     def _assemble(self, flat: TensorDictBase, size: int, rows: int) -> GradientStep:
-        names = wiring.check(self.loss, self.advantage, self.optimizer, flat[:size])
+        self._batch = flat[:size]
+        check_one_memory(self.loss, self.advantage)
+        names = wiring.check(self.loss, self.advantage, self.optimizer, self._batch)
         per_rollout = self.epochs * -(-rows // size)
-        steps = None if self.total_frames is None else self.total_frames / rows * per_rollout
+        steps = None if self.total_frames is None else self.total_frames / flat.numel() * per_rollout
         return GradientStep(
             self.loss,
             self.optimizer,

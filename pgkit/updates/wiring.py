@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
 
@@ -11,7 +12,8 @@ from torch import nn
 from torch.optim import Optimizer
 
 from pgkit.errors import UserError
-from pgkit.updates.optimizers import parameters
+from pgkit.updates import entries, owners
+from pgkit.updates.chain import Chain
 
 
 def read_keys(loss: nn.Module, data: TensorDictBase) -> list[Any]:
@@ -30,61 +32,66 @@ def read_keys(loss: nn.Module, data: TensorDictBase) -> list[Any]:
     return [key for key in dict.fromkeys(keys) if key in present]
 
 
-def check(loss: nn.Module, advantage: Any, optimizer: Optimizer, batch: TensorDictBase) -> list[str]:
+def check(
+    loss: nn.Module,
+    advantage: Any,
+    optimizer: Optimizer,
+    batch: TensorDictBase,
+    source: str = "the rollout",
+    settings: Mapping[str, Any] | None = None,
+) -> list[str]:
     """Runs the loss once on ``batch`` and checks the chain; returns the names of the loss's entries.
 
+    In this order: one owner of gamma and lambda; form of the entries; what the loss raises, traced to the entry, who
+    writes it and who reads it; the loss's result; action kind and bounds; the optimizer's parameters.
+
+    Args:
+        source: who hands the batch over.
+        settings: further objects that may hold a ``gamma``, by name.
+
     Raises:
-        UserError: one line that names the key or parameter, who writes it and who reads it.
+        UserError: one line that names the key or parameter, who writes it and who reads it, expected and found.
     """
-    name = type(loss).__name__
-    _one_owner("gamma", loss, advantage)
-    _one_owner("lmbda", loss, advantage)
+    chain = Chain(loss, advantage, source)
+    owners.check_settings(chain, dict(settings or {}))
+    buffers = [(x, x.clone()) for x in loss.buffers()]
+    entries.check_form(chain, batch)
     with torch.random.fork_rng(devices=[]):
-        try:
-            out = loss(batch.copy())
-        except (KeyError, ValueError, TypeError) as error:
-            reason = error.args[0] if error.args else error
-            source = "nothing (no advantage block)" if advantage is None else type(advantage).__name__
-            present = ", ".join(f"{key} {tuple(batch[key].shape)}" for key in batch.keys(True, True))
-            raise UserError(
-                f"{name} cannot read its batch: {reason}. The batch has {present}; its advantage is written by {source}"
-            ) from error
-    losses = [key for key in out.keys() if key.startswith("loss_")]
-    if not losses:
-        raise UserError(f"{name} returned no entry that begins with 'loss_' (only {', '.join(out.keys())})")
-    bad = [key for key in losses if out[key].numel() != 1]
-    if bad:
-        raise UserError(f"{name} returned '{bad[0]}' of shape {tuple(out[bad[0]].shape)}: a loss must be one number")
-    _check_parameters(name, loss, optimizer, sum(out[key].sum() for key in losses))
+        out = _run(chain, batch)
+        _check_result(chain, batch, out)
+        reason = entries.wrong_action(chain, batch)
+    if reason:
+        raise UserError(reason)
+    total = torch.stack([out[key].sum() for key in out.keys() if key.startswith("loss_")]).sum()
+    owners.check_parameters(chain, optimizer, total)
+    for x, before in buffers:  # statistics that a forward pass updates
+        x.copy_(before)
     return [key for key in out.keys() if out[key].numel() == 1]
 
 
-def _one_owner(what: str, loss: nn.Module, advantage: Any) -> None:
-    mine, theirs = (
-        getattr(getattr(loss, "_value_estimator", None), what, None),
-        getattr(advantage, what, None),
-    )
-    if mine is not None and theirs is not None and float(mine) != float(theirs):
-        raise UserError(
-            f"two owners of {what}: {type(advantage).__name__} has {float(theirs):g}, the value estimator inside "
-            f"{type(loss).__name__} has {float(mine):g}; set it in one place"
-        )
+def _run(chain: Chain, batch: TensorDictBase) -> TensorDictBase:
+    try:
+        return chain.loss(batch.copy())
+    except UserError:
+        raise
+    except (KeyError, ValueError, TypeError, RuntimeError, IndexError) as error:
+        reason = entries.explain(chain, batch, error)
+        if reason is None:
+            raise
+        raise UserError(reason) from error
 
 
-def _check_parameters(name: str, loss: nn.Module, optimizer: Optimizer, total: Any) -> None:
-    trained = parameters(optimizer)
-    ids = {id(p) for p in trained}
-    names = {id(p): key for key, p in loss.named_parameters()}
-    missing = [key for key, p in loss.named_parameters() if p.requires_grad and id(p) not in ids]
-    if missing:
+def _check_result(chain: Chain, batch: TensorDictBase, out: TensorDictBase) -> None:
+    losses = [key for key in out.keys() if key.startswith("loss_")]
+    if not losses:
         raise UserError(
-            f"parameter '{missing[0]}' of {name} (and {len(missing) - 1} more) is in no group of the optimizer: "
-            "build it from [*actor.parameters(), *critic.parameters()] or freeze the parameter (requires_grad_(False))"
+            f"{chain.name} returned no entry that begins with 'loss_' (only {', '.join(out.keys())}): the sum of "
+            "those is what the update minimizes"
         )
-    grads = torch.autograd.grad(total, trained, allow_unused=True)
-    unused = [names.get(id(p), f"of shape {tuple(p.shape)}") for p, g in zip(trained, grads, strict=True) if g is None]
-    if unused:
+    bad = [key for key in losses if out[key].numel() != 1]
+    if bad:
         raise UserError(
-            f"the optimizer holds parameter '{unused[0]}' (and {len(unused) - 1} more) that no loss_* entry of {name} "
-            "depends on: was the optimizer built for another agent?"
+            f"{chain.name} returned '{bad[0]}' of shape {tuple(out[bad[0]].shape)}, the update expects one number: "
+            "take the mean (reduction='mean')"
         )
+    entries.check_values(chain, batch, out, losses)

@@ -247,39 +247,3 @@ def test_torchrl_parts_unmodified():
 def test_advantage_is_normalized_by_one_owner_only():
     with pytest.raises(UserError, match="normalizes the advantage already"):
         make_agent(normalize_advantage=True)
-
-
-class TestWiring:
-    def test_missing_advantage(self):
-        with pytest.raises(UserError, match="has no 'advantage'.*written by nothing"):
-            make_agent(advantage=None)(make_rollout())
-
-    def test_wrong_shape(self):
-        rollout = make_rollout()
-        rollout["action_log_prob"] = rollout["action_log_prob"].unsqueeze(-1)
-        with pytest.raises(UserError, match=r"old_log_prob has shape \(32, 1\) but log_prob has shape \(32,\)"):
-            make_agent()(rollout)
-
-    def test_parameter_without_optimizer(self):
-        update = make_agent()
-        update.optimizer = torch.optim.Adam(list(update.loss.parameters())[:-1])
-        with pytest.raises(UserError, match="is in no group of the optimizer"):
-            update(make_rollout())
-
-    def test_optimizer_of_another_agent(self):
-        update = make_agent()
-        update.optimizer.add_param_group({"params": [torch.nn.Parameter(torch.zeros(7))]})
-        with pytest.raises(UserError, match=r"parameter 'of shape \(7,\)'.*no loss_\* entry"):
-            update(make_rollout())
-
-    def test_two_owners_of_gamma(self):
-        update = make_agent()
-        update.loss.make_value_estimator(gamma=0.9)
-        with pytest.raises(UserError, match="two owners of gamma: GAE has 0.99, .* has 0.9"):
-            update(make_rollout())
-
-    def test_no_loss_entry(self):
-        update = make_agent()
-        update.loss.forward = lambda batch: TensorDict({"objective": batch["advantage"].mean()})
-        with pytest.raises(UserError, match="no entry that begins with 'loss_'"):
-            update(make_rollout())
