@@ -1,6 +1,7 @@
-"""Soft actor-critic with twin critics and automatic temperature, for continuous actions.
+"""Soft actor-critic and its descendants, for continuous actions: critics, value head, replay and pace are flags.
 
-The defaults are the MuJoCo settings; tuned values for other environments are in ``PRESETS`` below.
+The defaults are the MuJoCo settings of SAC; tuned values for other environments are in ``PRESETS`` below, the settings
+that make REDQ, TQC, DroQ and CrossQ in ``VARIANTS``.
 """
 
 from __future__ import annotations
@@ -8,11 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Literal
 
 import torch
 from torchrl.data import LazyMemmapStorage, LazyTensorStorage
 
-from pgkit import collectors, controllers, data, envs, losses, modules, run, updates
+from pgkit import collectors, controllers, data, envs, heads, losses, modules, run, updates
 
 
 @dataclass
@@ -21,6 +23,29 @@ class Args(run.RunArgs):
 
     env_id: str = "HalfCheetah-v5"
     """Gymnasium id, or dm_control/<domain>-<task>-v0."""
+    variant: str = ""
+    """Start from the settings of redq, tqc, droq or crossq."""
+    critic: Literal["mlp", "layernorm", "simba", "crossq", "droq"] = "mlp"
+    """Perceptrons; with layer norm; with residual blocks and normalized observations; with batch renorm and a joint
+    forward pass in place of target networks; with dropout and layer norm."""
+    value_head: Literal["scalar", "quantile", "categorical"] = "scalar"
+    """Critics learn the expected return, quantiles of the return, or the expected return as a classification."""
+    num_critics: int = 2
+    """Critics."""
+    subset: int | None = None
+    """Critics that make the target, drawn anew for each update; None: all."""
+    actor_value: Literal["min", "mean"] = "min"
+    """The actor maximizes the least of the critics, or their mean."""
+    dropout: float = 0.01
+    """Probability of a zero in the hidden layers of a droq critic."""
+    atoms: int = 25
+    """Quantiles of each critic."""
+    drop_atoms: int = 2
+    """Largest atoms left out of the target, for each critic."""
+    bins: int = 101
+    """Classes of a categorical critic."""
+    value_range: tuple[float, float] = (-1_000.0, 1_000.0)
+    """Least and largest discounted return of a categorical critic."""
     total_frames: int = 1_000_000
     """Env steps to train for, all envs together; with action_repeat, decisions."""
     num_envs: int = 1
@@ -47,6 +72,8 @@ class Args(run.RunArgs):
     """Adam's step size for the critics."""
     alpha_learning_rate: float = 3e-4
     """Adam's step size for the temperature."""
+    beta1: float = 0.9
+    """Adam's first decay rate."""
     gamma: float = 0.99
     """Discount."""
     tau: float = 0.005
@@ -61,14 +88,16 @@ class Args(run.RunArgs):
     """Frames that the replay buffer keeps."""
     buffer_dir: Path | None = None
     """Keep the replay buffer in files of this folder (a buffer beyond RAM); None keeps it in memory."""
-    n_steps: int = 1
+    n_step: int = 1
     """Length of the returns that the critics learn."""
-    prioritized: bool = False
-    """Draw frames in proportion to the critics' errors."""
+    replay: Literal["uniform", "prioritized"] = "uniform"
+    """Draw frames uniformly, or in proportion to the critics' errors."""
     save_buffer: bool = False
     """Save the replay buffer beside each checkpoint, so that a resumed run goes on bit for bit."""
     hidden: tuple[int, ...] = (256, 256)
-    """Sizes of the hidden layers, of actor and critics alike."""
+    """Sizes of the hidden layers; for simba, one residual block each, as wide as the last."""
+    critic_hidden: tuple[int, ...] | None = None
+    """Those of the critics; None: as the actor's."""
     log_every: int = 1_000
     """A row of metrics every so many frames."""
 
@@ -81,14 +110,49 @@ PRESETS = {
     "dmc:*": dict(total_frames=500_000, action_repeat=2),
 }
 
+VARIANTS = {
+    "redq": dict(num_critics=10, subset=2, actor_value="mean", updates_per_step=20.0, actor_delay=20),
+    "droq": dict(critic="droq", actor_value="mean", updates_per_step=20.0, actor_delay=20),
+    "tqc": dict(value_head="quantile", num_critics=5, actor_value="mean"),
+    "crossq": dict(
+        critic="crossq", actor_delay=3, beta1=0.5, learning_rate=1e-3, q_learning_rate=1e-3, alpha_learning_rate=1e-3
+    ),
+}
+
+
+def networks(args: Args, env: envs.VectorEnv) -> tuple[modules.Actor, modules.QValue, modules.ObsNormalizer | None]:
+    """The actor, the critics, and what normalizes the observations of both."""
+    bodies = {
+        "simba": lambda sizes: partial(modules.simba, width=sizes[-1], blocks=len(sizes)),
+        "crossq": lambda sizes: partial(modules.batch_renorm_mlp, hidden=sizes),
+    }
+    hidden, body = args.critic_hidden or args.hidden, bodies.get(args.critic)
+    normalizer = modules.ObsNormalizer(env) if args.critic == "simba" else None
+    encoder = modules.Encoder(env, body(args.hidden)) if body else None
+    actor = modules.tanh_normal_actor(env, args.hidden, encoder=encoder, normalizer=normalizer)
+    critics = modules.q_value(
+        env,
+        args.num_critics,
+        hidden,
+        norm=modules.EnsembleLayerNorm if args.critic in ("layernorm", "droq") else None,
+        dropout=args.dropout if args.critic == "droq" else 0.0,
+        body=body(hidden) if body else None,
+        head={
+            "scalar": None,
+            "quantile": heads.Quantiles(args.atoms, args.drop_atoms),
+            "categorical": heads.Bins(*args.value_range, size=args.bins),
+        }[args.value_head],
+        normalizer=normalizer,
+    )
+    return actor, critics, normalizer
+
 
 def main(args: Args) -> None:
     """Trains, logs, evaluates, saves."""
-    with run.Run(args, recipe="sac") as log:
+    with run.Run(args, recipe=args.variant or "sac") as log:
         make_env = partial(envs.make, args.env_id, action_repeat=args.action_repeat)
         env = make_env(num_envs=args.num_envs, seed=args.seed, workers=args.workers)
-        actor = modules.tanh_normal_actor(env, args.hidden)
-        critics = modules.q_value(env, num_critics=2, hidden=args.hidden)
+        actor, critics, normalizer = networks(args, env)
         if args.alpha is not None:
             temperature = controllers.FixedTemperature(args.alpha)
         else:
@@ -99,8 +163,8 @@ def main(args: Args) -> None:
         buffer = data.ReplayBuffer(
             env,
             args.buffer_size,
-            n_steps=args.n_steps,
-            sampler=data.Prioritized() if args.prioritized else None,
+            n_steps=args.n_step,
+            sampler=data.Prioritized() if args.replay == "prioritized" else None,
             storage=partial(LazyMemmapStorage, scratch_dir=args.buffer_dir) if args.buffer_dir else LazyTensorStorage,
         )
         groups = [
@@ -108,10 +172,12 @@ def main(args: Args) -> None:
             {"params": list(critics.parameters()), "lr": args.q_learning_rate},
             {"params": list(temperature.parameters()), "lr": args.alpha_learning_rate},
         ]
+        make_loss = losses.CrossQLoss if args.critic == "crossq" else losses.SACLoss
+        settings = {"subset": args.subset, "actor_value": args.actor_value, "gamma": args.gamma}
         update = updates.OffPolicyUpdate(
-            loss=losses.SACLoss(actor, critics, temperature=temperature, gamma=args.gamma),
+            loss=make_loss(actor, critics, temperature=temperature, **settings),
             buffer=buffer,
-            optimizer=torch.optim.Adam([group for group in groups if group["params"]]),
+            optimizer=torch.optim.Adam([g for g in groups if g["params"]], betas=(args.beta1, 0.999)),
             batch_size=args.batch_size,
             updates_per_step=args.updates_per_step,
             actor_delay=args.actor_delay,
@@ -133,6 +199,8 @@ def main(args: Args) -> None:
         replay = data.BesideCheckpoint(buffer, log.dir / "checkpoints" / "buffer.pt", save=args.save_buffer)
         log.track(policy=actor, eval_env=make_env, update=update, collector=collector, replay=replay)
         for rollout in collector:
+            if normalizer is not None:
+                normalizer.update(rollout["observation"])
             metrics = update(rollout)
             if args.asynchronous:
                 metrics["policy_lag"] = collector.lag
@@ -142,4 +210,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    run.launch(main, Args, PRESETS)
+    run.launch(main, Args, PRESETS, variants=VARIANTS)

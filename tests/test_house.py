@@ -9,10 +9,11 @@ ROOT = Path(__file__).parent.parent
 THIRD_PARTY = {"torch", "tensordict", "torchrl", "gymnasium"}
 MAY_IMPORT = {
     "functional": {"torch"},
-    "modules": {"torch", "tensordict", "torchrl"},
+    "heads": {"functional", "torch"},
+    "modules": {"heads", "torch", "tensordict", "torchrl"},
     "advantages": {"functional", "torch", "tensordict", "torchrl"},
     "controllers": {"functional", "torch"},
-    "losses": {"functional", "torch", "tensordict", "torchrl"},
+    "losses": {"functional", "heads", "torch", "tensordict", "torchrl"},
     "updates": {"data", "torch", "tensordict"},
     "data": {"torch", "tensordict", "torchrl"},
     "collectors": {"envs", "torch", "tensordict", "torchrl"},

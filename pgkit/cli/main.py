@@ -83,8 +83,12 @@ def positive(text: str) -> int:
 
 
 def list_recipes(_: argparse.Namespace) -> None:
-    for name in recipes.names():
-        print(f"{name:<12} {recipes.first_line(recipes.find(name))}")
+    lines = {name: recipes.first_line(recipes.find(name)) for name in recipes.names()}
+    for name, (recipe, settings) in recipes.variants().items():
+        flags = (f"--{key.replace('_', '-')} {value}" for key, value in settings.items())
+        lines[name] = f"{recipe} {' '.join(flags)}"
+    for name in sorted(lines):
+        print(f"{name:<12} {lines[name]}")
 
 
 def copy_recipe(args: argparse.Namespace) -> None:
@@ -96,12 +100,14 @@ def copy_recipe(args: argparse.Namespace) -> None:
     if not target.parent.is_dir():
         raise UserError(f"no directory {target.parent} to copy into")
     shutil.copyfile(source, target)
-    print(f"copied to {target}; train with: pgkit run {target}")
+    variant = f" --variant {args.recipe}" if args.recipe in recipes.variants() else ""
+    print(f"copied to {target}; train with: pgkit run {target}{variant}")
 
 
 def run_recipe(args: argparse.Namespace) -> None:
     path = recipes.find(args.recipe)
-    sys.argv = [args.recipe, *args.flags]
+    variant = ["--variant", args.recipe] if args.recipe in recipes.variants() else []
+    sys.argv = [args.recipe, *variant, *args.flags]
     sys.path.insert(0, str(path.resolve().parent))
     script = types.ModuleType("__main__")  # as runpy.run_path does it, but argv[0] stays what the user typed
     script.__file__ = str(path.resolve())

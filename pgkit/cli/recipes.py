@@ -3,6 +3,7 @@
 import ast
 import difflib
 from pathlib import Path
+from typing import Any
 
 from pgkit.errors import UserError
 
@@ -15,8 +16,24 @@ def recipes_dir() -> Path:
 
 
 def names() -> list[str]:
-    """Names of the shipped recipes."""
+    """Names of the shipped recipes, each one file."""
     return sorted(path.stem for path in recipes_dir().glob("*.py") if not path.name.startswith("_"))
+
+
+def variants() -> dict[str, tuple[str, dict[str, Any]]]:
+    """Names that stand for a recipe with other settings: ``name -> (recipe, settings)``, from its ``VARIANTS``.
+
+    The recipes are read, not run: ``VARIANTS`` is written as a dict of ``dict(setting=value, ...)``.
+    """
+    found = {}
+    for recipe in names():
+        for node in ast.parse((recipes_dir() / f"{recipe}.py").read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "VARIANTS":
+                entries: Any = node.value
+                for name, call in zip(entries.keys, entries.values, strict=True):
+                    settings = {keyword.arg: ast.literal_eval(keyword.value) for keyword in call.keywords}
+                    found[ast.literal_eval(name)] = (recipe, settings)
+    return dict(sorted(found.items()))
 
 
 def first_line(path: Path) -> str:
@@ -25,13 +42,17 @@ def first_line(path: Path) -> str:
 
 
 def find(recipe: str) -> Path:
-    """The file of a recipe given as a shipped name (``ppo``) or a path (``mine.py``)."""
+    """The file of a recipe given as a shipped name (``ppo``), a variant's (``redq``), or a path (``mine.py``)."""
     if recipe.endswith(".py") or "/" in recipe:
         path = Path(recipe)
         if not path.is_file():
             raise UserError(f"no recipe file {recipe}; copy a shipped one with: pgkit cp ppo {recipe}")
         return path
-    if recipe not in names():
-        close = ", ".join(difflib.get_close_matches(recipe, names(), cutoff=0.3) or names())
+    if recipe not in (known := names()):
+        named = variants()
+        if recipe in named:
+            return recipes_dir() / f"{named[recipe][0]}.py"
+        known = sorted([*known, *named])
+        close = ", ".join(difflib.get_close_matches(recipe, known, cutoff=0.3) or known)
         raise UserError(f"no recipe named {recipe}; nearest: {close} (pgkit ls lists all; a file ends in .py)")
     return recipes_dir() / f"{recipe}.py"

@@ -2,9 +2,22 @@
 
 from pgkit.losses.base import Loss
 from pgkit.losses.clip_ppo import ClipPPOLoss
+from pgkit.losses.crossq import CrossQLoss
 from pgkit.losses.policy_base import PolicyLoss
 from pgkit.losses.q_base import QLoss
+from pgkit.losses.redq import REDQLoss
 from pgkit.losses.sac import SACLoss
 from pgkit.losses.soft_base import SoftQLoss
+from pgkit.losses.tqc import TQCLoss
 
-__all__ = ["ClipPPOLoss", "Loss", "PolicyLoss", "QLoss", "SACLoss", "SoftQLoss"]
+__all__ = [
+    "ClipPPOLoss",
+    "CrossQLoss",
+    "Loss",
+    "PolicyLoss",
+    "QLoss",
+    "REDQLoss",
+    "SACLoss",
+    "SoftQLoss",
+    "TQCLoss",
+]

@@ -14,7 +14,9 @@ from torch import Tensor
 from torchrl.modules.distributions.utils import rsample_and_log_prob
 from torchrl.objectives.utils import ValueEstimators, _vmap_func
 
+from pgkit.errors import UserError
 from pgkit.functional import bootstrap_target
+from pgkit.heads import Head, Scalar
 from pgkit.losses.base import Loss
 
 
@@ -22,20 +24,21 @@ class QLoss(Loss):
     """Base of the losses of an actor and an ensemble of action values, with delayed target networks.
 
     It holds the networks as TorchRL does (``qvalue_network_params``, ``target_qvalue_network_params``, ...), owns the
-    discount, names the keys, and gives subclasses four verbs: :meth:`act`, :meth:`q`, :meth:`target`,
-    :meth:`write_priority`.
+    discount, names the keys, and gives subclasses these verbs: :meth:`act` (for a deterministic actor :meth:`action`),
+    :meth:`q`, :meth:`target`, :meth:`write_priority`.
 
     Args:
-        actor_network: probabilistic actor.
-        qvalue_network: an ensemble, ``state_action_value [*B, critics]`` with an attribute ``num_critics``
-            (:func:`pgkit.modules.q_value`); or a list of modules with ``[*B, 1]``; or one such module, which is
-            copied ``num_qvalue_nets`` times with weights drawn again, as in TorchRL.
+        actor_network: probabilistic actor, or a deterministic one.
+        qvalue_network: an ensemble, ``state_action_value [*B, critics]`` (with a head ``[*B, critics, size]``) and an
+            attribute ``num_critics`` (:func:`pgkit.modules.q_value`); or a list of modules with ``[*B, 1]``; or one
+            such module, which is copied ``num_qvalue_nets`` times with weights drawn again, as in TorchRL.
         num_qvalue_nets: how many critics; an ensemble or a list brings its own number.
         gamma: discount. This loss is its only owner.
         delay_actor: use a delayed actor in the target.
         delay_qvalue: use delayed critics in the target.
         separate_losses: parameters that both networks share are trained by the policy's loss only.
         reduction: ``mean``, ``sum`` or ``none``.
+        head: what the critics' outputs stand for, one of :mod:`pgkit.heads`; None: the network's own, or else a scalar.
     """
 
     @dataclass
@@ -70,21 +73,26 @@ class QLoss(Loss):
         delay_qvalue: bool = True,
         separate_losses: bool = False,
         reduction: str | None = None,
+        head: Head | None = None,
     ) -> None:
         super().__init__(reduction)
         self.register_coeff_buffer("gamma", gamma)
         self.convert_to_functional(actor_network, "actor_network", create_target_params=delay_actor)
         several = isinstance(qvalue_network, Sequence) and not isinstance(qvalue_network, torch.nn.Module)
         ensemble = not several and hasattr(qvalue_network, "num_critics")
+        self.num_critics = len(qvalue_network) if several else getattr(qvalue_network, "num_critics", num_qvalue_nets)
+        own = getattr(qvalue_network[0] if several else qvalue_network, "head", None)
+        self.head = head or (own if isinstance(own, Head) else Scalar())
         self.convert_to_functional(
             list(qvalue_network) if several else qvalue_network,
             "qvalue_network",
-            None if ensemble else len(qvalue_network) if several else num_qvalue_nets,
+            None if ensemble else self.num_critics,
             create_target_params=delay_qvalue,
             compare_against=list(actor_network.parameters()) if separate_losses else None,
         )
         self._each = None if ensemble else _vmap_func(self.qvalue_network, (None, 0), randomness=self.vmap_randomness)
-        self.set_keys(action=actor_network.dist_sample_keys[0], log_prob=actor_network.log_prob_keys[0])
+        if hasattr(actor_network, "dist_sample_keys"):
+            self.set_keys(action=actor_network.dist_sample_keys[0], log_prob=actor_network.log_prob_keys[0])
 
     def act(self, batch: TensorDictBase, params: Any) -> tuple[Tensor, Tensor]:
         """An action drawn from the policy at the batch's observations, and its log-probability ``[*B]``: one draw."""
@@ -92,19 +100,40 @@ class QLoss(Loss):
             dist = self.actor_network.get_dist(batch.select(*self.actor_network.in_keys))
         return rsample_and_log_prob(dist)
 
-    def q(self, batch: TensorDictBase, action: Tensor, params: Any) -> Tensor:
-        """The critics' values ``[*B, critics]`` of ``action`` at the batch's observations."""
+    def action(self, batch: TensorDictBase, params: Any) -> Tensor:
+        """A deterministic actor's action ``[*B, actions]`` at the batch's observations."""
+        with params.to_module(self.actor_network, preserve_module_state=False):
+            out = self.actor_network(batch.select(*self.actor_network.in_keys))
+        return out.get(self.tensor_keys.action)
+
+    def returns(self, batch: TensorDictBase, action: Tensor, params: Any, members: Tensor | None = None) -> Tensor:
+        """What the head reads, ``[*B, critics, size]``, for ``action`` at the batch's observations.
+
+        ``members`` names the critics to evaluate, in the order of the result; None: all.
+        """
         data = batch.select(*self.qvalue_network.in_keys, strict=False).set(self.tensor_keys.action, action)
         if self._each is not None:
-            return self._each(data, params).get(self.tensor_keys.state_action_value).squeeze(-1).movedim(0, -1)
+            params = params if members is None else params[members]
+            return self._each(data, params).get(self.tensor_keys.state_action_value).movedim(0, -2)
+        members_of = getattr(self.qvalue_network, "members", None)
+        if members is not None and members_of is not None:
+            params, members = members_of(params, members), None
         with params.to_module(self.qvalue_network, preserve_module_state=False):
-            return self.qvalue_network(data).get(self.tensor_keys.state_action_value)
+            out = self.qvalue_network(data).get(self.tensor_keys.state_action_value)
+        out = out if out.dim() > data.dim() + 1 else out.unsqueeze(-1)
+        return out if members is None else out[..., members, :]
+
+    def q(self, batch: TensorDictBase, action: Tensor, params: Any) -> Tensor:
+        """The critics' values ``[*B, critics]`` of ``action`` at the batch's observations."""
+        return self.head.mean(self.returns(batch, action, params))
 
     def target(self, batch: TensorDictBase, next_value: Tensor) -> Tensor:
-        """The bootstrapped target ``[*B]`` of the next state's value ``[*B]``."""
+        """The bootstrapped target of the next state's value ``[*B]``, or of its atoms ``[*B, K]``; same shape."""
         keys, after = self.tensor_keys, batch["next"]
-        terminated, steps = after[keys.terminated], batch.get(keys.steps_to_next_obs, None)
-        return bootstrap_target(after[keys.reward], next_value.unsqueeze(-1), terminated, self.gamma, steps).squeeze(-1)
+        atoms = next_value.reshape(*batch.batch_size, -1)
+        reward, terminated = (after[key].expand_as(atoms) for key in (keys.reward, keys.terminated))
+        steps = batch.get(keys.steps_to_next_obs, None)
+        return bootstrap_target(reward, atoms, terminated, self.gamma, steps).reshape(next_value.shape)
 
     def weight(self, batch: TensorDictBase) -> Tensor | float:
         """The importance weights ``[*B]`` of a prioritized replay, 1 for any other."""
@@ -128,3 +157,12 @@ class QLoss(Loss):
         keys, networks = self.tensor_keys, [*self.actor_network.in_keys, *self.qvalue_network.in_keys]
         after = [*self.actor_network.in_keys, keys.reward, keys.done, keys.terminated]
         return [keys.action, *networks, *[("next", *((key,) if isinstance(key, str) else key)) for key in after]]
+
+
+def refuse_stochastic(loss: str, actor: TensorDictModule) -> None:
+    """Raises ``UserError`` for an actor that draws its actions from a distribution."""
+    if hasattr(actor, "dist_sample_keys"):
+        raise UserError(
+            f"{loss} needs an actor that gives one action, this one draws it from a distribution: use "
+            "modules.deterministic_actor, or losses.SACLoss for this actor"
+        )

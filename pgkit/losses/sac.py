@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import dispatch
-from tensordict.utils import NestedKey
 
-from pgkit.functional import same_shape, soft_value, twin_minimum, value_loss
+from pgkit.functional import same_shape, soft_returns
 from pgkit.losses.soft_base import SoftQLoss
 
 
@@ -25,15 +24,15 @@ class SACLoss(SoftQLoss):
     TorchRL's: the critics' loss is the squared error (there ``smooth_l1``), ``gamma`` is given here, the importance
     weights of a prioritized replay apply to the critics alone.
 
+    The equations are those of scalar critics. Critics with another head (:mod:`pgkit.heads`) pool their distributions
+    in place of the minimum, and learn by the head's own loss; ``subset`` and ``actor_value`` make it REDQ.
+
     The arguments are those of :class:`~pgkit.losses.SoftQLoss`; the actor is over continuous actions, e.g.
     :func:`pgkit.modules.tanh_normal_actor`.
 
     Writes ``loss_actor``, ``loss_qvalue``, ``loss_alpha`` and the metrics ``alpha``, ``entropy``, ``q_value``; and
     ``td_error [*B]`` into the batch, the priority of a prioritized replay.
     """
-
-    def _writes(self) -> list[NestedKey]:
-        return ["loss_actor", "loss_qvalue", "loss_alpha", "alpha", "entropy", "q_value"]
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -42,25 +41,16 @@ class SACLoss(SoftQLoss):
 
         with torch.no_grad():
             next_action, next_log_prob = self.act(batch["next"], self.target_actor_network_params)
-            next_q = self.q(batch["next"], next_action, self.target_qvalue_network_params)
-            target = self.target(batch, soft_value(next_q, next_log_prob, alpha))
+            next_returns = self.returns(batch["next"], next_action, self.target_qvalue_network_params, self.draw())
+            atoms, weights = self.head.pool(next_returns)
+            atoms = self.target(batch, soft_returns(atoms, next_log_prob, alpha))
 
-        q = self.q(batch, batch[self.tensor_keys.action], self.qvalue_network_params)
-        target = target.unsqueeze(-1).expand_as(q)
-        qvalue_loss = value_loss(q, target, self.loss_function).sum(-1) * self.weight(batch)
-        self.write_priority(batch, q - target)
+        returns = self.returns(batch, batch[self.tensor_keys.action], self.qvalue_network_params)
+        qvalue_loss = self.head.loss(returns, atoms, weights).sum(-1) * self.weight(batch)
+        q = self.head.mean(returns)
+        self.write_priority(batch, q - (atoms * weights).sum(-1, keepdim=True))
 
         action, log_prob = self.act(batch, self.actor_network_params)
-        value = twin_minimum(self.q(batch, action, self.qvalue_network_params.detach()))
+        value = self.actor_value(self.q(batch, action, self.qvalue_network_params.detach()))
         same_shape(log_prob=log_prob, value=value)
-        actor_loss = alpha * log_prob - value
-
-        out = TensorDict(
-            {
-                "loss_actor": self.reduce(actor_loss, batch),
-                "loss_qvalue": self.reduce(qvalue_loss, batch),
-                "loss_alpha": self.reduce(self.temperature_loss(action, log_prob), batch),
-            }
-        )
-        out["alpha"], out["entropy"], out["q_value"] = alpha, -log_prob.detach().mean(), q.detach().mean()
-        return out
+        return self.result(batch, alpha * log_prob - value, qvalue_loss, action, log_prob, q)

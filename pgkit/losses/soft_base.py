@@ -37,8 +37,8 @@ class SoftQLoss(QLoss):
         num_qvalue_nets, gamma, delay_actor, delay_qvalue, separate_losses, reduction, head: as in ``QLoss``.
 
     Raises:
-        UserError: the actor is discrete and the loss is not (``takes_discrete``); ``subset`` is above the number of
-            critics.
+        UserError: the actor is discrete and the loss is not, or the other way round (``takes_discrete``); ``subset`` is
+            above the number of critics.
     """
 
     takes_discrete: ClassVar[bool] = False
@@ -68,8 +68,7 @@ class SoftQLoss(QLoss):
         reduction: str | None = None,
         head: Head | None = None,
     ) -> None:
-        if not self.takes_discrete:
-            _refuse_discrete(type(self).__name__, actor_network)
+        _check_actions(type(self).__name__, actor_network, self.takes_discrete)
         super().__init__(
             actor_network, qvalue_network, num_qvalue_nets=num_qvalue_nets, gamma=gamma, delay_actor=delay_actor,
             delay_qvalue=delay_qvalue, separate_losses=separate_losses, reduction=reduction, head=head,
@@ -141,12 +140,18 @@ class SoftQLoss(QLoss):
         return ["loss_actor", "loss_qvalue", "loss_alpha", "alpha", "entropy", "q_value"]
 
 
-def _refuse_discrete(loss: str, actor: TensorDictModule) -> None:
+def _check_actions(loss: str, actor: TensorDictModule, discrete: bool) -> None:
     for module in actor.modules():
         kind = getattr(module, "distribution_class", None)
-        if kind is not None and not getattr(kind, "has_rsample", True):
+        if kind is None or discrete == (not getattr(kind, "has_rsample", True)):
+            continue
+        if discrete:
             raise UserError(
-                f"{loss} needs an actor over continuous actions, this one is {kind.__name__}: use "
-                "modules.tanh_normal_actor, or for discrete actions modules.categorical_actor with "
-                "losses.ClipPPOLoss or TorchRL's DiscreteSACLoss"
+                f"{loss} needs an actor over discrete actions, this one is {kind.__name__}: use "
+                "modules.categorical_actor, or losses.SACLoss for this actor"
             )
+        raise UserError(
+            f"{loss} needs an actor over continuous actions, this one is {kind.__name__}: use "
+            "modules.tanh_normal_actor, or for discrete actions modules.categorical_actor with "
+            "losses.DiscreteSACLoss or losses.ClipPPOLoss"
+        )

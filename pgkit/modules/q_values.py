@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
+from pgkit.heads import Head
+from pgkit.modules.bodies import Body, Norm, ensemble_mlp
+from pgkit.modules.ensemble import EnsembleLinear
 from pgkit.modules.sizes import action_size, observation_size
 
 
@@ -18,61 +23,64 @@ def q_value(
     hidden: Sequence[int] = (256, 256),
     activation: type[nn.Module] = nn.ReLU,
     *,
+    norm: Norm | None = None,
+    dropout: float = 0.0,
+    body: Body | None = None,
+    head: Head | None = None,
     normalizer: nn.Module | None = None,
-) -> TensorDictModule:
+) -> QValue:
     """Action values: ``observation [*B, obs]``, ``action [*B, actions]`` -> ``state_action_value [*B, num_critics]``.
 
     The critics are the last dimension, so that the result fits a TensorDict of batch size ``B``; all of them are
-    evaluated by one batched matrix product a layer. TorchRL's losses stack their critics themselves: give those a
-    list of modules with ``num_critics=1``.
+    evaluated by one batched matrix product a layer. With a ``head`` the result is ``[*B, num_critics, head.size]``.
+    TorchRL's losses stack their critics themselves: give those a list of modules with ``num_critics=1``.
 
     Args:
         env: sizes come from its specs.
         num_critics: independent critics, each with its own initialization.
         hidden: sizes of the hidden layers.
         activation: class of the activation.
+        norm: of each hidden layer, e.g. :class:`~pgkit.modules.EnsembleLayerNorm`.
+        dropout: probability of a zero in each hidden layer while training.
+        body: replaces the hidden layers and the four arguments before, e.g. ``partial(modules.simba, width=256)``.
+        head: what the outputs stand for, one of :mod:`pgkit.heads`; None: one number, the expected return.
         normalizer: applied to the observation first.
     """
-    net = CriticEnsemble(observation_size(env) + action_size(env), num_critics, hidden, activation, normalizer)
-    return TensorDictModule(net, in_keys=["observation", "action"], out_keys=["state_action_value"])
+    features = observation_size(env) + action_size(env)
+    if body is None:
+        layers, last = ensemble_mlp(num_critics, features, hidden, activation, norm, dropout)
+    else:
+        layers, last = body(num_critics, features)
+    layers.append(EnsembleLinear(num_critics, last, 1 if head is None else head.size, gain=1.0))
+    return QValue(CriticEnsemble(layers, normalizer, scalar=head is None), num_critics, head)
+
+
+class QValue(TensorDictModule):
+    """``num_critics`` action values with their ``head``; a loss can evaluate some of the critics alone."""
+
+    def __init__(self, net: CriticEnsemble, num_critics: int, head: Head | None) -> None:
+        super().__init__(net, in_keys=["observation", "action"], out_keys=["state_action_value"])
+        self.num_critics, self.head = num_critics, head
+
+    def members(self, params: Any, index: Tensor) -> Any:
+        """The parameters (and buffers) of the critics ``index [K]`` out of ``params``, for a functional call."""
+        inner = params["module"]
+        shared = {name: value for name, value in inner.items() if name != "layers"}
+        return TensorDict({"module": {**shared, "layers": inner["layers"].apply(lambda x: x[index])}})
 
 
 class CriticEnsemble(nn.Module):
-    """``num_critics`` perceptrons side by side: ``[*B, obs], [*B, actions] -> [*B, num_critics]``."""
+    """Critics side by side: ``[*B, obs], [*B, actions] -> [*B, critics]``, or ``[*B, critics, size]``."""
 
-    def __init__(
-        self,
-        features: int,
-        num_critics: int,
-        hidden: Sequence[int],
-        activation: type[nn.Module],
-        normalizer: nn.Module | None = None,
-    ) -> None:
+    def __init__(self, layers: Sequence[nn.Module], normalizer: nn.Module | None, scalar: bool) -> None:
         super().__init__()
-        self.num_critics, self.normalizer = num_critics, normalizer
-        layers: list[nn.Module] = []
-        for size in hidden:
-            layers += [EnsembleLinear(num_critics, features, size, gain=2**0.5), activation()]
-            features = size
-        self.layers = nn.Sequential(*layers, EnsembleLinear(num_critics, features, 1, gain=1.0))
+        self.normalizer, self.scalar = normalizer, scalar
+        self.layers = nn.Sequential(*layers)
 
     def forward(self, observation: Tensor, action: Tensor) -> Tensor:
         if self.normalizer is not None:
             observation = self.normalizer(observation)
         x = torch.cat([observation, action], -1)
-        q = self.layers(x.reshape(-1, x.shape[-1]).expand(self.num_critics, -1, -1))
-        return q.squeeze(-1).t().reshape(*x.shape[:-1], self.num_critics)
-
-
-class EnsembleLinear(nn.Module):
-    """``num`` linear layers as one ``baddbmm``: ``[num, B, in] -> [num, B, out]``; orthogonal weights, zero biases."""
-
-    def __init__(self, num: int, in_features: int, out_features: int, gain: float) -> None:
-        super().__init__()
-        self.weight = nn.Parameter(torch.empty(num, in_features, out_features))
-        self.bias = nn.Parameter(torch.zeros(num, 1, out_features))
-        for member in self.weight.data:
-            nn.init.orthogonal_(member, gain)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return torch.baddbmm(self.bias, x, self.weight)
+        critics = self.layers[-1].weight.shape[0]
+        out = self.layers(x.reshape(-1, x.shape[-1]).expand(critics, -1, -1)).transpose(0, 1)
+        return (out.squeeze(-1) if self.scalar else out).reshape(*x.shape[:-1], *out.shape[1 : 2 if self.scalar else 3])

@@ -1,0 +1,71 @@
+"""CrossQ (Bhatt et al., 2024, https://arxiv.org/abs/1902.05605)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule, dispatch
+
+from pgkit.functional import same_shape, soft_returns
+from pgkit.losses.soft_base import SoftQLoss
+
+
+class CrossQLoss(SoftQLoss):
+    r"""CrossQ: no target network; batch normalization sees both action distributions in one joint forward pass.
+
+    .. math::
+        \begin{bmatrix} Q_i(s, a) \\ Q_i(s', a') \end{bmatrix} &=
+            Q_i\Big(\begin{bmatrix} s, a \\ s', a' \end{bmatrix}\Big), \quad a' \sim \pi(\cdot|s') \\
+        y &= r + \gamma (1 - \text{terminated}) \big(\min_i Q_i(s', a') - \alpha \log \pi(a'|s')\big)
+             \quad \text{(no gradient)} \\
+        L_Q &= \frac1B \sum \sum_i (Q_i(s, a) - y)^2 \\
+        L_\pi &= \frac1B \sum \alpha \log \pi(\tilde a|s) - \min_i Q_i(s, \tilde a)
+
+    The critics want batch normalization: ``modules.q_value(env, body=modules.batch_renorm_mlp)``. In
+    :math:`L_\pi` it uses its running statistics.
+
+    A drop-in for TorchRL's loss of that name; there the distance is ``smooth_l1``.
+
+    Args:
+        actor_network: as in :class:`~pgkit.losses.SACLoss`.
+        qvalue_network: likewise.
+        settings: the other settings of :class:`~pgkit.losses.SoftQLoss`, but ``delay_qvalue`` and ``delay_actor``.
+
+    Writes what ``SACLoss`` writes.
+    """
+
+    def __init__(
+        self,
+        actor_network: TensorDictModule,
+        qvalue_network: TensorDictModule | Sequence[TensorDictModule],
+        **settings: Any,
+    ) -> None:
+        super().__init__(actor_network, qvalue_network, delay_actor=False, delay_qvalue=False, **settings)
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Losses and metrics of a batch ``[B]`` of transitions; nothing in it is changed, ``td_error`` is added."""
+        batch, alpha = tensordict, self.alpha
+
+        with torch.no_grad():
+            next_action, next_log_prob = self.act(batch["next"], self.actor_network_params)
+        keys = self.qvalue_network.in_keys
+        both = torch.cat([batch.select(*keys, strict=False), batch["next"].select(*keys, strict=False)])
+        action = torch.cat([batch[self.tensor_keys.action], next_action])
+        returns, next_returns = self.returns(both, action, self.qvalue_network_params).chunk(2)
+
+        with torch.no_grad():
+            subset = self.draw()
+            atoms, weights = self.head.pool(next_returns if subset is None else next_returns[..., subset, :])
+            atoms = self.target(batch, soft_returns(atoms, next_log_prob, alpha))
+        qvalue_loss = self.head.loss(returns, atoms, weights).sum(-1) * self.weight(batch)
+        q = self.head.mean(returns)
+        self.write_priority(batch, q - (atoms * weights).sum(-1, keepdim=True))
+
+        action, log_prob = self.act(batch, self.actor_network_params)
+        value = self.actor_value(self.q(batch, action, self.qvalue_network_params.detach()))
+        same_shape(log_prob=log_prob, value=value)
+        return self.result(batch, alpha * log_prob - value, qvalue_loss, action, log_prob, q)

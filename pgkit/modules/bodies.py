@@ -1,0 +1,110 @@
+"""Hidden layers of an ensemble: ``(num, features) -> (modules that read [num, B, features], features they give)``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor, nn
+from torchrl.envs import EnvBase
+
+from pgkit.modules.ensemble import EnsembleBatchRenorm, EnsembleLayerNorm, EnsembleLinear
+from pgkit.modules.sizes import observation_size
+
+Layers = tuple[list[nn.Module], int]
+Body = Callable[[int, int], Layers]
+Norm = Callable[[int, int], nn.Module]
+
+
+def ensemble_mlp(
+    num: int,
+    features: int,
+    hidden: Sequence[int] = (256, 256),
+    activation: type[nn.Module] = nn.ReLU,
+    norm: Norm | None = None,
+    dropout: float = 0.0,
+) -> Layers:
+    """Perceptrons; a layer is linear, dropout, norm, activation (DroQ's order, https://arxiv.org/abs/2110.02034).
+
+    Args:
+        num: members.
+        features: size of the input.
+        hidden: sizes of the layers.
+        activation: class of the activation.
+        norm: ``(num, features) -> module``, e.g. :class:`~pgkit.modules.EnsembleLayerNorm`; None: none.
+        dropout: probability of a zero, drawn for every member, row and unit.
+    """
+    layers: list[nn.Module] = []
+    for size in hidden:
+        layers.append(EnsembleLinear(num, features, size, gain=2**0.5))
+        layers += [nn.Dropout(dropout)] if dropout else []
+        layers += [norm(num, size)] if norm else []
+        layers.append(activation())
+        features = size
+    return layers, features
+
+
+def batch_renorm_mlp(
+    num: int,
+    features: int,
+    hidden: Sequence[int] = (256, 256),
+    activation: type[nn.Module] = nn.ReLU,
+    norm: Norm = EnsembleBatchRenorm,
+) -> Layers:
+    """Perceptrons with batch renormalization of the input and after each activation, as in CrossQ.
+
+    Bhatt et al., 2024 (https://arxiv.org/abs/1902.05605). Arguments as in :func:`ensemble_mlp`.
+    """
+    layers: list[nn.Module] = [norm(num, features)]
+    for size in hidden:
+        layers += [EnsembleLinear(num, features, size, gain=2**0.5), activation(), norm(num, size)]
+        features = size
+    return layers, features
+
+
+def simba(num: int, features: int, width: int = 256, blocks: int = 2, expansion: int = 4) -> Layers:
+    """A residual encoder: linear, ``blocks`` residual blocks, layer norm.
+
+    SimBa (Lee et al., 2024, https://arxiv.org/abs/2410.09754); its observations are normalized by running statistics:
+    give :func:`~pgkit.modules.q_value` an ``ObsNormalizer`` as well.
+
+    Args:
+        num: members.
+        features: size of the input.
+        width: size of the residual stream.
+        blocks: how many blocks.
+        expansion: a block's hidden layer is so many times as wide.
+    """
+    layers: list[nn.Module] = [EnsembleLinear(num, features, width, gain=1.0)]
+    layers += [ResidualBlock(num, width, expansion * width) for _ in range(blocks)]
+    return [*layers, EnsembleLayerNorm(num, width)], width
+
+
+class ResidualBlock(nn.Module):
+    """``x + linear(relu(linear(layer_norm(x))))``, ``[num, B, width]`` to the same."""
+
+    def __init__(self, num: int, width: int, hidden: int) -> None:
+        super().__init__()
+        self.norm = EnsembleLayerNorm(num, width)
+        self.inner = EnsembleLinear(num, width, hidden, gain=2**0.5)
+        self.outer = EnsembleLinear(num, hidden, width, gain=1.0)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x + self.outer(torch.relu(self.inner(self.norm(x))))
+
+
+class Encoder(nn.Module):
+    """A body for one network, to be an actor's ``encoder=``: ``[*B, obs] -> [*B, features]``.
+
+    Args:
+        env: its observation gives the size of the input.
+        body: ``(num, features) -> layers``, e.g. ``partial(modules.simba, width=128, blocks=1)``.
+    """
+
+    def __init__(self, env: EnvBase, body: Body) -> None:
+        super().__init__()
+        layers, self.features = body(1, observation_size(env))
+        self.layers = nn.Sequential(*layers)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.layers(x.reshape(1, -1, x.shape[-1])).reshape(*x.shape[:-1], self.features)

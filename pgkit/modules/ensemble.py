@@ -1,0 +1,97 @@
+"""Layers of several networks side by side, ``[num, B, features]``: one batched operation for all of them.
+
+Every parameter and buffer begins with the dimension ``num``, so that some members can be taken out by an index.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+
+class EnsembleLinear(nn.Module):
+    """``num`` linear layers as one ``baddbmm``: ``[num, B, in] -> [num, B, out]``; orthogonal weights, zero biases."""
+
+    def __init__(self, num: int, in_features: int, out_features: int, gain: float) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.empty(num, in_features, out_features))
+        self.bias = nn.Parameter(torch.zeros(num, 1, out_features))
+        for member in self.weight.data:
+            nn.init.orthogonal_(member, gain)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return torch.baddbmm(self.bias, x, self.weight)
+
+
+class EnsembleLayerNorm(nn.Module):
+    """``num`` layer norms (Ba et al., 2016, https://arxiv.org/abs/1607.06450): ``[num, B, features]`` to the same."""
+
+    def __init__(self, num: int, features: int) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.ones(num, 1, features))
+        self.bias = nn.Parameter(torch.zeros(num, 1, features))
+
+    def forward(self, x: Tensor) -> Tensor:
+        return torch.addcmul(self.bias, F.layer_norm(x, x.shape[-1:]), self.weight)
+
+
+class EnsembleBatchRenorm(nn.Module):
+    r"""``num`` batch renormalizations (Ioffe, 2017, https://arxiv.org/abs/1702.03275), ``[num, B, features]`` to same.
+
+    .. math::
+        y = w \Big(\frac{x - \mu_B}{\sigma_B} r + d\Big) + b, \qquad
+        r = \text{clip}\Big(\frac{\sigma_B}{\sigma}, \frac1{r_{max}}, r_{max}\Big), \quad
+        d = \text{clip}\Big(\frac{\mu_B - \mu}{\sigma}, \pm d_{max}\Big)
+
+    :math:`\mu, \sigma` are running statistics, kept as buffers. The first ``warmup`` steps are plain batch
+    normalization (:math:`r = 1, d = 0`). The batch's statistics are used, and the running ones updated, only where
+    gradients reach this layer's own weights: never in evaluation, under ``no_grad``, or through detached parameters, as
+    in a target or in an actor's loss. There :math:`y = w (x - \mu) / \sigma + b`.
+
+    Args:
+        num: members.
+        features: size of the last dimension.
+        momentum: share of the batch's statistics that the running ones take over.
+        eps: added to variances.
+        r_max, d_max: bounds of the correction.
+        warmup: steps before it begins.
+    """
+
+    mean: Tensor
+    var: Tensor
+    steps: Tensor
+
+    def __init__(
+        self,
+        num: int,
+        features: int,
+        *,
+        momentum: float = 0.01,
+        eps: float = 1e-3,
+        r_max: float = 3.0,
+        d_max: float = 5.0,
+        warmup: int = 100_000,
+    ) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.ones(num, 1, features))
+        self.bias = nn.Parameter(torch.zeros(num, 1, features))
+        self.register_buffer("mean", torch.zeros(num, 1, features))
+        self.register_buffer("var", torch.ones(num, 1, features))
+        self.register_buffer("steps", torch.zeros(num, 1, 1))
+        self.momentum, self.eps, self.r_max, self.d_max, self.warmup = momentum, eps, r_max, d_max, warmup
+
+    def forward(self, x: Tensor) -> Tensor:
+        running = (self.var + self.eps).sqrt()
+        if not (self.training and torch.is_grad_enabled() and self.weight.requires_grad):
+            return (x - self.mean) / running * self.weight + self.bias
+        var, mean = torch.var_mean(x, 1, correction=0, keepdim=True)
+        std = (var + self.eps).sqrt()
+        with torch.no_grad():
+            late = (self.steps >= self.warmup).to(x.dtype)
+            r = 1 + late * ((std / running).clamp(1 / self.r_max, self.r_max) - 1)
+            d = late * ((mean - self.mean) / running).clamp(-self.d_max, self.d_max)
+            self.mean.lerp_(mean, self.momentum)
+            self.var.lerp_(var, self.momentum)
+            self.steps.add_(1)
+        return ((x - mean) / std * r + d) * self.weight + self.bias
