@@ -4,9 +4,10 @@ from pgkit.modules.actors import actor, gaussian_actor, tanh_normal_actor
 from pgkit.modules.bodies import Encoder, batch_renorm_mlp, ensemble_mlp, simba
 from pgkit.modules.deterministic import deterministic_actor
 from pgkit.modules.discrete import categorical_actor
+from pgkit.modules.discrete_q_values import discrete_q_value
 from pgkit.modules.encoders import dict_encoder
 from pgkit.modules.ensemble import EnsembleBatchRenorm, EnsembleLayerNorm, EnsembleLinear
-from pgkit.modules.exploration import GaussianExploration
+from pgkit.modules.exploration import GaussianExploration, OrnsteinUhlenbeck
 from pgkit.modules.mlp import mlp
 from pgkit.modules.normalizers import ObsNormalizer, ReturnScale
 from pgkit.modules.q_values import QValue, q_value
@@ -19,6 +20,7 @@ __all__ = [
     "EnsembleLinear",
     "GaussianExploration",
     "ObsNormalizer",
+    "OrnsteinUhlenbeck",
     "QValue",
     "ReturnScale",
     "actor",
@@ -26,6 +28,7 @@ __all__ = [
     "categorical_actor",
     "deterministic_actor",
     "dict_encoder",
+    "discrete_q_value",
     "ensemble_mlp",
     "gaussian_actor",
     "mlp",

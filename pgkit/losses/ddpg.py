@@ -1,0 +1,110 @@
+"""Deep deterministic policy gradient (Lillicrap et al., 2016, https://arxiv.org/abs/1509.02971)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule, dispatch
+from tensordict.utils import NestedKey
+
+from pgkit.errors import UserError
+from pgkit.heads import Head, Scalar
+from pgkit.losses.q_base import QLoss, refuse_stochastic
+
+
+class DDPGLoss(QLoss):
+    r"""DDPG: one critic and a deterministic actor that climbs it, a drop-in for TorchRL's loss of that name.
+
+    .. math::
+        y &= r + \gamma (1 - \text{terminated}) Q'(s', \mu'(s')) \\
+        L_Q &= \frac1B \sum (Q(s, a) - y)^2 \\
+        L_\pi &= -\frac1B \sum Q(s, \mu(s))
+
+    The equations are those of a scalar critic. One with another head (:mod:`pgkit.heads`) learns by the head's loss.
+
+    Defaults that differ from TorchRL's: the target's action is the delayed actor's, as in the paper (there
+    ``delay_actor=False``), ``gamma`` is given here, the importance weights of a prioritized replay apply to the critic
+    alone.
+
+    Args:
+        actor_network: deterministic actor, e.g. :func:`pgkit.modules.deterministic_actor`.
+        value_network: one critic, ``state_action_value [*B, 1]``, e.g. ``pgkit.modules.q_value(env, num_critics=1)``.
+        loss_function: distance of a scalar critic: ``l2``, ``l1`` or ``smooth_l1``.
+        delay_actor, delay_value: use a delayed actor, a delayed critic in the target.
+        gamma, separate_losses, reduction, head: as in :class:`~pgkit.losses.QLoss`.
+
+    Writes ``loss_actor``, ``loss_value`` and, as numbers, the metrics ``pred_value``, ``target_value`` (means),
+    ``pred_value_max``, ``target_value_max``; and ``td_error [*B]`` into the batch, a prioritized replay's priority.
+
+    Raises:
+        UserError: the actor draws its actions from a distribution, or there are several critics.
+    """
+
+    def __init__(
+        self,
+        actor_network: TensorDictModule,
+        value_network: TensorDictModule,
+        *,
+        loss_function: str = "l2",
+        gamma: float = 0.99,
+        delay_actor: bool = True,
+        delay_value: bool = True,
+        separate_losses: bool = False,
+        reduction: str | None = None,
+        head: Head | None = None,
+    ) -> None:
+        refuse_stochastic("DDPGLoss", actor_network)
+        critics = getattr(value_network, "num_critics", 1)
+        if critics != 1:
+            raise UserError(f"DDPGLoss has one critic, these are {critics}: num_critics=1, or losses.TD3Loss for two")
+        super().__init__(
+            actor_network, value_network if hasattr(value_network, "num_critics") else [value_network], gamma=gamma,
+            delay_actor=delay_actor, delay_qvalue=delay_value, separate_losses=separate_losses, reduction=reduction,
+            head=head,
+        )  # fmt: skip
+        if isinstance(self.head, Scalar):
+            self.head = Scalar(loss_function)
+
+    @property
+    def value_network_params(self) -> Any:
+        """TorchRL's name of the critic's parameters."""
+        return self.qvalue_network_params
+
+    @property
+    def target_value_network_params(self) -> Any:
+        """TorchRL's name of the delayed critic's parameters."""
+        return self.target_qvalue_network_params
+
+    def _writes(self) -> list[NestedKey]:
+        return ["loss_actor", "loss_value", "pred_value", "target_value", "pred_value_max", "target_value_max"]
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Losses and metrics of a batch ``[*B]`` of transitions; nothing in it is changed, ``td_error`` is added."""
+        batch = tensordict
+
+        with torch.no_grad():
+            next_action = self.action(batch["next"], self.target_actor_network_params)
+            next_returns = self.returns(batch["next"], next_action, self.target_qvalue_network_params)
+            atoms, weights = self.head.pool(next_returns)
+            atoms = self.target(batch, atoms)
+
+        returns = self.returns(batch, batch[self.tensor_keys.action], self.qvalue_network_params)
+        critic_loss = self.head.loss(returns, atoms, weights).squeeze(-1) * self.weight(batch)
+        q, target = self.head.mean(returns), (atoms * weights).sum(-1, keepdim=True)
+        self.write_priority(batch, q - target)
+
+        action = self.action(batch, self.actor_network_params)
+        value = self.q(batch, action, self.qvalue_network_params.detach()).squeeze(-1)
+
+        out = TensorDict(
+            {
+                "loss_actor": self.reduce(-value, batch),
+                "loss_value": self.reduce(critic_loss, batch),
+            }
+        )
+        out["pred_value"], out["pred_value_max"] = q.detach().mean(), q.detach().max()
+        out["target_value"], out["target_value_max"] = target.mean(), target.max()
+        return out

@@ -1,0 +1,137 @@
+"""Soft actor-critic for discrete actions (Christodoulou, 2019, https://arxiv.org/abs/1910.07207)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import log
+from typing import Any, Literal
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule, dispatch
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.data import TensorSpec
+
+from pgkit.functional import expected_soft_value, straight_through_sample, twin_minimum, value_loss
+from pgkit.losses.soft_base import SoftQLoss
+
+
+class DiscreteSACLoss(SoftQLoss):
+    r"""SAC over discrete actions with twin critics and automatic temperature, a drop-in for TorchRL's loss.
+
+    .. math::
+        V(s) &= \sum_a w_a(s) \big(\min_i Q_i(s, a) - \alpha \log \pi(a|s)\big) \\
+        y &= r + \gamma (1 - \text{terminated}) V'(s') \\
+        L_Q &= \frac1B \sum \sum_i (Q_i(s, a) - y)^2 \\
+        L_\pi &= -\frac1B \sum V(s) \\
+        L_\alpha &= -\frac1B \sum \log\alpha \, \Big(\sum_a w_a \log \pi(a|s) + \bar H\Big)
+
+    ``form="expectation"``: :math:`w = \pi(\cdot|s)`, no sampling noise. ``form="gumbel_softmax"``: :math:`w` is one
+    action drawn from the policy, one-hot, with the gradient of its Gumbel-Softmax relaxation (Jang et al., 2017,
+    https://arxiv.org/abs/1611.01144).
+
+    Defaults that differ from TorchRL's: the critics' loss is the squared error (there ``smooth_l1``), ``gamma`` is
+    given here, the number of actions is read off the first batch where ``num_actions`` is not given, the importance
+    weights of a prioritized replay apply to the critics alone.
+
+    Args:
+        actor_network: actor over discrete actions, e.g. :func:`pgkit.modules.categorical_actor`.
+        qvalue_network: an ensemble, ``action_value [*B, critics, actions]`` with an attribute ``num_critics``
+            (:func:`pgkit.modules.discrete_q_value`); or as in :class:`~pgkit.losses.QLoss`, ``[*B, actions]`` each.
+        action_space: not needed: whether actions are indices or one-hot is read off their shape.
+        num_actions: number of actions.
+        target_entropy_weight: with ``target_entropy="auto"``, :math:`\bar H` is this times the largest entropy,
+            :math:`\log(\text{actions})`.
+        target_entropy: :math:`\bar H`, or ``auto``.
+        form: ``expectation`` or ``gumbel_softmax``.
+        relaxation: temperature of the relaxation, for ``gumbel_softmax``.
+        loss_function: ``l2``, ``l1`` or ``smooth_l1``.
+        settings: the other settings of :class:`~pgkit.losses.SoftQLoss`.
+
+    Writes what :class:`~pgkit.losses.SACLoss` writes.
+    """
+
+    takes_discrete = True
+
+    @dataclass
+    class _AcceptedKeys(SoftQLoss._AcceptedKeys):
+        """Keys that :meth:`set_keys` can change."""
+
+        action_value: NestedKey = "action_value"
+
+    default_keys = _AcceptedKeys
+
+    def __init__(
+        self,
+        actor_network: TensorDictModule,
+        qvalue_network: TensorDictModule | Sequence[TensorDictModule],
+        *,
+        action_space: str | TensorSpec | None = None,
+        num_actions: int | None = None,
+        target_entropy_weight: float = 0.98,
+        target_entropy: str | float = "auto",
+        form: Literal["expectation", "gumbel_softmax"] = "expectation",
+        relaxation: float = 1.0,
+        loss_function: str = "l2",
+        **settings: Any,
+    ) -> None:
+        if target_entropy == "auto" and num_actions is not None:
+            target_entropy = target_entropy_weight * log(num_actions)
+        super().__init__(
+            actor_network, qvalue_network, target_entropy=target_entropy, loss_function=loss_function, **settings
+        )
+        if form not in ("expectation", "gumbel_softmax"):
+            raise ValueError(f"form is 'expectation' or 'gumbel_softmax', not {form!r}")
+        self.form, self.relaxation, self.loss_function = form, relaxation, loss_function
+        self.target_entropy_weight = target_entropy_weight
+
+    def policy(self, batch: TensorDictBase, params: Any) -> tuple[Tensor, Tensor]:
+        """Weights ``w`` and log-probabilities of all actions at the batch's observations, ``[*B, actions]`` each."""
+        with params.to_module(self.actor_network, preserve_module_state=False):
+            logits = self.actor_network.get_dist(batch.select(*self.actor_network.in_keys)).logits
+        log_prob = logits.log_softmax(-1).clamp_min(torch.finfo(logits.dtype).min)  # 0 log 0 = 0
+        if self.form == "expectation":
+            return log_prob.exp(), log_prob
+        return straight_through_sample(log_prob, self.relaxation), log_prob
+
+    def action_values(self, batch: TensorDictBase, params: Any) -> Tensor:
+        """The critics' values ``[*B, critics, actions]`` at the batch's observations."""
+        data, key = batch.select(*self.qvalue_network.in_keys), self.tensor_keys.action_value
+        if self._each is not None:
+            return self._each(data, params).get(key).movedim(0, -2)
+        with params.to_module(self.qvalue_network, preserve_module_state=False):
+            return self.qvalue_network(data).get(key)
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Losses and metrics of a batch ``[*B]`` of transitions; nothing in it is changed, ``td_error`` is added."""
+        batch, alpha = tensordict, self.alpha
+
+        with torch.no_grad():
+            next_weights, next_log_prob = self.policy(batch["next"], self.target_actor_network_params)
+            next_q = self.action_values(batch["next"], self.target_qvalue_network_params)
+            members = self.draw()
+            next_value = twin_minimum((next_q if members is None else next_q[..., members, :]).mT)
+            target = self.target(batch, expected_soft_value(next_weights, next_log_prob, next_value, alpha))
+
+        q_all = self.action_values(batch, self.qvalue_network_params)
+        q = _chosen(q_all, batch[self.tensor_keys.action])
+        target = target.unsqueeze(-1).expand_as(q)
+        qvalue_loss = value_loss(q, target, self.loss_function).sum(-1) * self.weight(batch)
+        self.write_priority(batch, q - target)
+
+        weights, log_prob = self.policy(batch, self.actor_network_params)
+        actor_loss = -expected_soft_value(weights, log_prob, self.actor_value(q_all.detach().mT), alpha)
+        if self._target_entropy is None:
+            self._target_entropy = self.target_entropy_weight * log(log_prob.shape[-1])
+        return self.result(batch, actor_loss, qvalue_loss, weights, (weights * log_prob).sum(-1), q)
+
+
+def _chosen(q: Tensor, action: Tensor) -> Tensor:
+    """Of ``q [*B, critics, actions]`` the action's, ``[*B, critics]``; the action is an index ``[*B]`` or one-hot."""
+    if action.dim() == q.dim() - 2:
+        index = action.reshape(*action.shape, 1, 1).expand(*q.shape[:-1], 1)
+        return q.gather(-1, index).squeeze(-1)
+    return (q * action.unsqueeze(-2)).sum(-1)

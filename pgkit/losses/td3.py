@@ -1,0 +1,128 @@
+"""Twin delayed deep deterministic policy gradient (Fujimoto et al., 2018, https://arxiv.org/abs/1802.09477)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule, dispatch
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.data import TensorSpec
+
+from pgkit.errors import UserError
+from pgkit.functional import smoothed_action
+from pgkit.heads import Head, Scalar
+from pgkit.losses.q_base import QLoss, refuse_stochastic
+
+
+class TD3Loss(QLoss):
+    r"""TD3: twin critics whose targets are smoothed over actions, a drop-in for TorchRL's loss of that name.
+
+    .. math::
+        a' &= \text{clip}\big(\mu'(s') + \text{clip}(\sigma \epsilon, \pm c), a_{low}, a_{high}\big),
+              \quad \epsilon \sim N(0, 1) \\
+        y &= r + \gamma (1 - \text{terminated}) \min_i Q'_i(s', a') \\
+        L_Q &= \frac1B \sum \sum_i (Q_i(s, a) - y)^2 \\
+        L_\pi &= -\frac1B \sum Q_1(s, \mu(s))
+
+    The equations are those of scalar critics. Critics with another head (:mod:`pgkit.heads`) pool their distributions
+    in place of the minimum, and learn by the head's own loss.
+
+    The third part of TD3, the delay, is the update's: ``OffPolicyUpdate(actor_delay=2, delay_targets=True)``. Defaults
+    that differ from TorchRL's: the critics' loss is the squared error (there ``smooth_l1``), ``gamma`` is given here,
+    the importance weights of a prioritized replay apply to the critics alone.
+
+    Args:
+        actor_network: deterministic actor, e.g. :func:`pgkit.modules.deterministic_actor`.
+        qvalue_network: critics, as in :class:`~pgkit.losses.QLoss`.
+        action_spec: bounded spec of one action.
+        bounds: ``(low, high)`` in its place.
+        policy_noise: :math:`\sigma`, in the unit of the action; a number, or a tensor ``[actions]``.
+        noise_clip: :math:`c`, likewise.
+        loss_function: distance of scalar critics: ``l2``, ``l1`` or ``smooth_l1``.
+        num_qvalue_nets, gamma, delay_actor, delay_qvalue, separate_losses, reduction, head: as in ``QLoss``.
+
+    Writes ``loss_actor``, ``loss_qvalue`` and, as means, the metrics ``pred_value``, ``state_action_value_actor``,
+    ``next_state_value``, ``target_value``; and ``td_error [*B]`` into the batch, the priority of a prioritized replay.
+
+    Raises:
+        UserError: the actor draws its actions from a distribution, or it is not exactly one of ``action_spec`` and
+            ``bounds`` that is given.
+    """
+
+    min_action: Tensor
+    max_action: Tensor
+    policy_noise: Tensor
+    noise_clip: Tensor
+
+    def __init__(
+        self,
+        actor_network: TensorDictModule,
+        qvalue_network: TensorDictModule | Sequence[TensorDictModule],
+        *,
+        action_spec: TensorSpec | None = None,
+        bounds: tuple[float | Tensor, float | Tensor] | None = None,
+        num_qvalue_nets: int = 2,
+        policy_noise: float | Tensor = 0.2,
+        noise_clip: float | Tensor = 0.5,
+        loss_function: str = "l2",
+        gamma: float = 0.99,
+        delay_actor: bool = True,
+        delay_qvalue: bool = True,
+        separate_losses: bool = False,
+        reduction: str | None = None,
+        head: Head | None = None,
+    ) -> None:
+        if (action_spec is None) == (bounds is None):
+            raise UserError("TD3Loss clips its smoothed actions: give it action_spec= or bounds=, one of the two")
+        refuse_stochastic("TD3Loss", actor_network)
+        super().__init__(
+            actor_network, qvalue_network, num_qvalue_nets=num_qvalue_nets, gamma=gamma, delay_actor=delay_actor,
+            delay_qvalue=delay_qvalue, separate_losses=separate_losses, reduction=reduction, head=head,
+        )  # fmt: skip
+        space: Any = getattr(action_spec, "space", None)
+        low, high = bounds or (space.low, space.high)
+        numbers = {"min_action": low, "max_action": high, "policy_noise": policy_noise, "noise_clip": noise_clip}
+        for name, number in numbers.items():
+            self.register_buffer(name, torch.as_tensor(number))
+        if isinstance(self.head, Scalar):
+            self.head = Scalar(loss_function)
+
+    def _writes(self) -> list[NestedKey]:
+        metrics = ["pred_value", "state_action_value_actor", "next_state_value", "target_value"]
+        return ["loss_actor", "loss_qvalue", *metrics]
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Losses and metrics of a batch ``[*B]`` of transitions; nothing in it is changed, ``td_error`` is added."""
+        batch = tensordict
+
+        with torch.no_grad():
+            next_action = smoothed_action(
+                self.action(batch["next"], self.target_actor_network_params),
+                self.policy_noise, self.noise_clip, self.min_action, self.max_action,
+            )  # fmt: skip
+            next_returns = self.returns(batch["next"], next_action, self.target_qvalue_network_params)
+            next_atoms, weights = self.head.pool(next_returns)
+            atoms = self.target(batch, next_atoms)
+
+        returns = self.returns(batch, batch[self.tensor_keys.action], self.qvalue_network_params)
+        qvalue_loss = self.head.loss(returns, atoms, weights).sum(-1) * self.weight(batch)
+        q, target = self.head.mean(returns), (atoms * weights).sum(-1, keepdim=True)
+        self.write_priority(batch, q - target)
+
+        action = self.action(batch, self.actor_network_params)
+        value = self.q(batch, action, self.qvalue_network_params.detach())[..., 0]
+
+        out = TensorDict(
+            {
+                "loss_actor": self.reduce(-value, batch),
+                "loss_qvalue": self.reduce(qvalue_loss, batch),
+            }
+        )
+        out["pred_value"], out["state_action_value_actor"] = q.detach().mean(), value.detach().mean()
+        out["next_state_value"], out["target_value"] = (next_atoms * weights).sum(-1).mean(), target.mean()
+        return out

@@ -1,0 +1,104 @@
+"""Exploration: an actor with noise on its actions, for collecting."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType, exploration_type
+
+from pgkit.modules.sizes import action_size, box_action
+
+
+class GaussianExploration(TensorDictModuleBase):
+    r"""An actor whose actions carry independent Gaussian noise, :math:`a + h \sigma \epsilon`, clipped to the bounds.
+
+    :math:`h` is half the range of the action, so that ``std`` means the same for every environment (Fujimoto et al.,
+    2018, https://arxiv.org/abs/1802.09477). Under TorchRL's ``set_exploration_type`` of any kind but ``RANDOM``, as in
+    evaluation, the action is the actor's own.
+
+    Args:
+        actor: writes ``action``; :func:`~pgkit.modules.deterministic_actor`.
+        env: the bounds come from its specs.
+        std: :math:`\sigma`; the buffer ``std`` may be changed while training.
+    """
+
+    std: Tensor
+
+    def __init__(self, actor: TensorDictModuleBase, env: EnvBase, std: float = 0.1) -> None:
+        super().__init__()
+        self.actor, self.bounds = actor, ActionBounds(env)
+        self.in_keys, self.out_keys = list(actor.in_keys), list(actor.out_keys)
+        self.register_buffer("std", torch.tensor(float(std)))
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """The actor's result, with noise on its ``action``."""
+        out = self.actor(tensordict)
+        if explores():
+            out["action"] = self.bounds(out["action"], self.std * torch.randn_like(out["action"]))
+        return out
+
+
+class OrnsteinUhlenbeck(TensorDictModuleBase):
+    r"""An actor whose actions carry noise that is correlated in time, clipped to the bounds.
+
+    .. math:: n_t = n_{t-1} - \theta\, n_{t-1} + \sigma \epsilon_t, \quad \epsilon_t \sim N(0, 1), \qquad a_t + h\, n_t
+
+    :math:`n` begins at zero with every episode, and :math:`h` is half the range of the action; in the long run
+    :math:`n` has the standard deviation :math:`\sigma / \sqrt{1 - (1 - \theta)^2}` (Lillicrap et al., 2016,
+    https://arxiv.org/abs/1509.02971). Without exploration, as in evaluation, the action is the actor's own.
+
+    The noise is carried from step to step as a recurrent policy's state is: ``recurrent_state [*B, actions]`` and
+    ``is_init [*B, 1]`` are read, ``("next", "recurrent_state")`` is written. pgkit's collectors supply them.
+
+    Args:
+        actor: writes ``action``; not recurrent itself.
+        env: the bounds come from its specs.
+        std: :math:`\sigma`; the buffer ``std`` may be changed while training.
+        theta: :math:`\theta`, how fast the noise is forgotten; 1 makes it independent.
+    """
+
+    std: Tensor
+
+    def __init__(self, actor: TensorDictModuleBase, env: EnvBase, std: float = 0.2, theta: float = 0.15) -> None:
+        super().__init__()
+        self.actor, self.bounds, self.theta, self.state_size = actor, ActionBounds(env), theta, action_size(env)
+        self.in_keys = [*actor.in_keys, "is_init", "recurrent_state"]
+        self.out_keys = [*actor.out_keys, ("next", "recurrent_state")]
+        self.register_buffer("std", torch.tensor(float(std)))
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """The actor's result, with noise on its ``action`` and the noise's next state."""
+        out = self.actor(tensordict)
+        if explores():
+            before = tensordict["recurrent_state"].masked_fill(tensordict["is_init"], 0.0)
+            noise = (1 - self.theta) * before + self.std * torch.randn_like(before)
+            out["action"] = self.bounds(out["action"], noise)
+            out["next", "recurrent_state"] = noise
+        return out
+
+
+class ActionBounds(nn.Module):
+    """``(action, noise) -> action + half_range * noise`` within the bounds of an environment's action."""
+
+    low: Tensor
+    high: Tensor
+    half_range: Tensor
+
+    def __init__(self, env: EnvBase) -> None:
+        super().__init__()
+        space: Any = box_action(env, needs_bounds=True).space
+        for name, x in (("low", space.low), ("high", space.high), ("half_range", (space.high - space.low) / 2)):
+            self.register_buffer(name, x.clone())
+
+    def forward(self, action: Tensor, noise: Tensor) -> Tensor:
+        return (action + self.half_range * noise).clamp(self.low, self.high)
+
+
+def explores() -> bool:
+    """Whether TorchRL's exploration type asks for noise; without one, it does."""
+    return exploration_type() in (ExplorationType.RANDOM, None)

@@ -1,0 +1,155 @@
+"""Soft actor-critic with twin critics and automatic temperature, for discrete actions.
+
+The defaults suit small observation vectors; tuned values for other environments are in ``PRESETS`` below.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+import torch
+from torchrl.data import LazyMemmapStorage, LazyTensorStorage
+
+from pgkit import collectors, controllers, data, envs, losses, modules, run, updates
+
+
+@dataclass
+class Args(run.RunArgs):
+    """Settings of discrete SAC."""
+
+    env_id: str = "CartPole-v1"
+    """Gymnasium id of an environment with discrete actions."""
+    total_frames: int = 1_000_000
+    """Env steps to train for, all envs together."""
+    num_envs: int = 1
+    """Envs stepped side by side."""
+    threads: int = 2
+    """Threads that PyTorch uses in this process; 2 is faster than 1 for networks 256 wide."""
+    steps: int = 1
+    """Steps each env takes between updates."""
+    asynchronous: bool = False
+    """Collect in another process while this one updates: rollouts are one update old, see train/policy_lag."""
+    random_frames: int = 1_000
+    """Frames with random actions at the start; updates begin after them."""
+    batch_size: int = 256
+    """Rows of a batch."""
+    updates_per_step: float = 1.0
+    """Gradient steps for each frame."""
+    actor_delay: int = 1
+    """The actor and the temperature learn at every so many-th gradient step."""
+    learning_rate: float = 3e-4
+    """Adam's step size for the actor."""
+    q_learning_rate: float = 3e-4
+    """Adam's step size for the critics."""
+    alpha_learning_rate: float = 3e-4
+    """Adam's step size for the temperature."""
+    gamma: float = 0.99
+    """Discount."""
+    tau: float = 0.005
+    """Share of the critics that their targets take over at each gradient step."""
+    alpha: float | None = None
+    """A fixed temperature; None trains it."""
+    alpha_init: float = 1.0
+    """The trained temperature at the start."""
+    target_entropy_weight: float = 0.98
+    """The temperature holds the entropy at this share of the largest one, log(actions)."""
+    form: Literal["expectation", "gumbel_softmax"] = "expectation"
+    """Weigh all actions by their probability, or draw one with the gradient of its Gumbel-Softmax relaxation."""
+    relaxation: float = 1.0
+    """Temperature of that relaxation."""
+    buffer_size: int = 1_000_000
+    """Frames that the replay buffer keeps."""
+    buffer_dir: Path | None = None
+    """Keep the replay buffer in files of this folder (a buffer beyond RAM); None keeps it in memory."""
+    n_step: int = 1
+    """Length of the returns that the critics learn."""
+    replay: Literal["uniform", "prioritized"] = "uniform"
+    """Draw frames uniformly, or in proportion to the critics' errors."""
+    save_buffer: bool = False
+    """Save the replay buffer beside each checkpoint, so that a resumed run goes on bit for bit."""
+    hidden: tuple[int, ...] = (256, 256)
+    """Sizes of the hidden layers, of actor and critics alike."""
+    log_every: int = 1_000
+    """A row of metrics every so many frames."""
+
+
+PRESETS = {
+    "CartPole-*": dict(
+        total_frames=100_000, eval_every=10_000, num_envs=4, updates_per_step=0.25, hidden=(64, 64), threads=1,
+        learning_rate=1e-3, q_learning_rate=1e-3, alpha_learning_rate=1e-3, target_entropy_weight=0.5,
+        buffer_size=100_000,
+    ),
+}  # fmt: skip
+
+
+def main(args: Args) -> None:
+    """Trains, logs, evaluates, saves."""
+    with run.Run(args, recipe="discrete_sac") as log:
+        make_env = partial(envs.make, args.env_id)
+        env = make_env(num_envs=args.num_envs, seed=args.seed, workers=args.workers)
+        actor = modules.categorical_actor(env, args.hidden, torch.nn.ReLU)
+        critics = modules.discrete_q_value(env, num_critics=2, hidden=args.hidden)
+        if args.alpha is not None:
+            temperature = controllers.FixedTemperature(args.alpha)
+        else:
+            target_entropy = args.target_entropy_weight * math.log(critics.module.actions)
+            temperature = controllers.Temperature(target_entropy, args.alpha_init)
+
+        buffer = data.ReplayBuffer(
+            env,
+            args.buffer_size,
+            n_steps=args.n_step,
+            sampler=data.Prioritized() if args.replay == "prioritized" else None,
+            storage=partial(LazyMemmapStorage, scratch_dir=args.buffer_dir) if args.buffer_dir else LazyTensorStorage,
+        )
+        groups = [
+            {"params": list(actor.parameters()), "lr": args.learning_rate},
+            {"params": list(critics.parameters()), "lr": args.q_learning_rate},
+            {"params": list(temperature.parameters()), "lr": args.alpha_learning_rate},
+        ]
+        update = updates.OffPolicyUpdate(
+            loss=losses.DiscreteSACLoss(
+                actor,
+                critics,
+                temperature=temperature,
+                form=args.form,
+                relaxation=args.relaxation,
+                gamma=args.gamma,
+            ),
+            buffer=buffer,
+            optimizer=torch.optim.Adam([group for group in groups if group["params"]]),
+            batch_size=args.batch_size,
+            updates_per_step=args.updates_per_step,
+            actor_delay=args.actor_delay,
+            tau=args.tau,
+            learning_starts=max(args.random_frames, args.batch_size),
+            total_frames=args.total_frames,
+            compile=args.compile,
+        )
+        make_collector = collectors.AsyncCollector if args.asynchronous else collectors.VectorCollector
+        collector = make_collector(
+            env,
+            actor,
+            frames_per_batch=args.num_envs * args.steps,
+            total_frames=args.total_frames,
+            init_random_frames=args.random_frames,
+            compile=args.compile,
+        )
+
+        replay = data.BesideCheckpoint(buffer, log.dir / "checkpoints" / "buffer.pt", save=args.save_buffer)
+        log.track(policy=actor, eval_env=make_env, update=update, collector=collector, replay=replay)
+        for rollout in collector:
+            metrics = update(rollout)
+            if args.asynchronous:
+                metrics["policy_lag"] = collector.lag
+            compile_seconds = update.compile_seconds + collector.compile_seconds
+            log.step(collector.frames, rollout, metrics, compile_seconds=compile_seconds, every=args.log_every)
+        collector.shutdown()
+
+
+if __name__ == "__main__":
+    run.launch(main, Args, PRESETS)

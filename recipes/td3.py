@@ -1,0 +1,146 @@
+"""Twin delayed DDPG: twin critics, smoothed targets and a delayed actor, for continuous actions.
+
+The defaults are the MuJoCo settings; tuned values for other environments are in ``PRESETS`` below.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+import torch
+from torchrl.data import LazyMemmapStorage, LazyTensorStorage
+
+from pgkit import collectors, data, envs, losses, modules, run, updates
+
+
+@dataclass
+class Args(run.RunArgs):
+    """Settings of TD3."""
+
+    env_id: str = "HalfCheetah-v5"
+    """Gymnasium id, or dm_control/<domain>-<task>-v0."""
+    total_frames: int = 1_000_000
+    """Env steps to train for, all envs together; with action_repeat, decisions."""
+    num_envs: int = 1
+    """Envs stepped side by side."""
+    threads: int = 2
+    """Threads that PyTorch uses in this process; 2 is faster than 1 for networks 256 wide."""
+    action_repeat: int = 1
+    """Simulator steps for each action."""
+    steps: int = 1
+    """Steps each env takes between updates."""
+    asynchronous: bool = False
+    """Collect in another process while this one updates: rollouts are one update old, see train/policy_lag."""
+    random_frames: int = 10_000
+    """Frames with random actions at the start; updates begin after them."""
+    exploration_noise: float = 0.1
+    """Standard deviation of the noise on collected actions, as a share of half the action's range."""
+    policy_noise: float = 0.2
+    """Standard deviation of the noise on the targets' actions, as a share of half the action's range."""
+    noise_clip: float = 0.5
+    """Bound of that noise, likewise."""
+    batch_size: int = 256
+    """Rows of a batch."""
+    updates_per_step: float = 1.0
+    """Gradient steps for each frame."""
+    actor_delay: int = 2
+    """The actor learns, and the targets move, at every so many-th gradient step."""
+    learning_rate: float = 3e-4
+    """Adam's step size for the actor."""
+    q_learning_rate: float = 3e-4
+    """Adam's step size for the critics."""
+    gamma: float = 0.99
+    """Discount."""
+    tau: float = 0.005
+    """Share of the trained networks that their targets take over when they move."""
+    buffer_size: int = 1_000_000
+    """Frames that the replay buffer keeps."""
+    buffer_dir: Path | None = None
+    """Keep the replay buffer in files of this folder (a buffer beyond RAM); None keeps it in memory."""
+    n_step: int = 1
+    """Length of the returns that the critics learn."""
+    replay: Literal["uniform", "prioritized"] = "uniform"
+    """Draw frames uniformly, or in proportion to the critics' errors."""
+    save_buffer: bool = False
+    """Save the replay buffer beside each checkpoint, so that a resumed run goes on bit for bit."""
+    hidden: tuple[int, ...] = (256, 256)
+    """Sizes of the hidden layers, of actor and critics alike."""
+    log_every: int = 1_000
+    """A row of metrics every so many frames."""
+
+
+PRESETS = {
+    "Pendulum-*": dict(
+        total_frames=20_000, eval_every=5_000, random_frames=1_000, learning_rate=1e-3, q_learning_rate=1e-3
+    ),
+    "dm_control/*": dict(total_frames=500_000, action_repeat=2),
+    "dmc:*": dict(total_frames=500_000, action_repeat=2),
+}
+
+
+def main(args: Args) -> None:
+    """Trains, logs, evaluates, saves."""
+    with run.Run(args, recipe="td3") as log:
+        make_env = partial(envs.make, args.env_id, action_repeat=args.action_repeat)
+        env = make_env(num_envs=args.num_envs, seed=args.seed, workers=args.workers)
+        actor = modules.deterministic_actor(env, args.hidden)
+        critics = modules.q_value(env, num_critics=2, hidden=args.hidden)
+        exploring = modules.GaussianExploration(actor, env, args.exploration_noise)
+
+        buffer = data.ReplayBuffer(
+            env,
+            args.buffer_size,
+            n_steps=args.n_step,
+            sampler=data.Prioritized() if args.replay == "prioritized" else None,
+            storage=partial(LazyMemmapStorage, scratch_dir=args.buffer_dir) if args.buffer_dir else LazyTensorStorage,
+        )
+        groups = [
+            {"params": list(actor.parameters()), "lr": args.learning_rate},
+            {"params": list(critics.parameters()), "lr": args.q_learning_rate},
+        ]
+        update = updates.OffPolicyUpdate(
+            loss=losses.TD3Loss(
+                actor,
+                critics,
+                action_spec=env.action_spec_unbatched,
+                policy_noise=args.policy_noise * exploring.bounds.half_range,
+                noise_clip=args.noise_clip * exploring.bounds.half_range,
+                gamma=args.gamma,
+            ),
+            buffer=buffer,
+            optimizer=torch.optim.Adam(groups),
+            batch_size=args.batch_size,
+            updates_per_step=args.updates_per_step,
+            actor_delay=args.actor_delay,
+            delay_targets=True,
+            tau=args.tau,
+            learning_starts=max(args.random_frames, args.batch_size),
+            total_frames=args.total_frames,
+            compile=args.compile,
+        )
+        make_collector = collectors.AsyncCollector if args.asynchronous else collectors.VectorCollector
+        collector = make_collector(
+            env,
+            exploring,
+            frames_per_batch=args.num_envs * args.steps,
+            total_frames=args.total_frames,
+            init_random_frames=args.random_frames,
+            compile=args.compile,
+        )
+
+        replay = data.BesideCheckpoint(buffer, log.dir / "checkpoints" / "buffer.pt", save=args.save_buffer)
+        log.track(policy=actor, eval_env=make_env, update=update, collector=collector, replay=replay)
+        for rollout in collector:
+            metrics = update(rollout)
+            if args.asynchronous:
+                metrics["policy_lag"] = collector.lag
+            compile_seconds = update.compile_seconds + collector.compile_seconds
+            log.step(collector.frames, rollout, metrics, compile_seconds=compile_seconds, every=args.log_every)
+        collector.shutdown()
+
+
+if __name__ == "__main__":
+    run.launch(main, Args, PRESETS)

@@ -1,0 +1,46 @@
+"""The discrete SAC recipe as a user runs it."""
+
+import json
+
+import pytest
+
+from tests.recipes.test_ppo import pgkit, rows
+
+SMALL = ["--batch-size", 32, "--hidden", 16, "--threads", 1, "--compile", "off", "--eval-episodes", 1]
+
+
+def train(run_dir, *argv, frames=600):
+    flags = ["--env-id", "CartPole-v1", "--eval-every", 300, "--random-frames", 100, "--log-every", 50, "--num-envs", 1]
+    return pgkit("run", "discrete_sac", *flags, *SMALL, "--total-frames", frames, "--run-dir", run_dir, *argv)
+
+
+@pytest.mark.parametrize("form", ["expectation", "gumbel_softmax"])
+def test_resumed_with_its_buffer_it_equals_the_straight_run(tmp_path, form):
+    train(tmp_path / "straight", "--save-buffer", "--form", form)
+    train(tmp_path / "resumed", "--save-buffer", "--form", form, frames=300)
+    pgkit("run", "discrete_sac", "--resume", tmp_path / "resumed", "--total-frames", 600)
+    assert rows(tmp_path / "straight") == rows(tmp_path / "resumed")
+    assert rows(tmp_path / "straight")[-1]["train/loss_alpha"]
+
+
+@pytest.mark.parametrize(
+    "flags",
+    [
+        ("--env-id", "Acrobot-v1", "--num-envs", 2, "--steps", 5, "--workers", 2, "--actor-delay", 2),
+        ("--n-step", 3, "--replay", "prioritized", "--alpha", 0.1),
+    ],
+)
+def test_runs_for_a_few_hundred_frames(tmp_path, flags):
+    train(tmp_path / "run", *flags, frames=300)
+    assert json.loads((tmp_path / "run" / "summary.json").read_text())["frames"] >= 300
+
+
+def test_a_continuous_action_is_one_line_and_exit_2(tmp_path):
+    done = pgkit("run", "discrete_sac", "--env-id", "Pendulum-v1", "--run-dir", tmp_path / "run", ok=False)
+    assert done.returncode == 2 and "tanh_normal_actor" in done.stderr and "Traceback" not in done.stderr
+
+
+@pytest.mark.slow
+def test_learns_cartpole(tmp_path):
+    pgkit("run", "discrete_sac", "--env-id", "CartPole-v1", "--seed", 11, "--run-dir", tmp_path / "run")
+    assert json.loads((tmp_path / "run" / "summary.json").read_text())["eval/mean_reward"] >= 450
