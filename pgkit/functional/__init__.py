@@ -1,6 +1,7 @@
 """Pure tensor maths: one idea a function, shapes checked, results unreduced."""
 
 from pgkit.functional.checks import is_flag, same_shape
+from pgkit.functional.discrete import expected_soft_value, straight_through_sample
 from pgkit.functional.distributional import (
     categorical_mean,
     categorical_projection,
@@ -10,6 +11,7 @@ from pgkit.functional.distributional import (
     two_hot,
 )
 from pgkit.functional.returns import discounted_sum, generalized_advantage
+from pgkit.functional.smoothing import smoothed_action
 from pgkit.functional.soft import (
     bootstrap_target,
     ensemble_mean,
@@ -32,6 +34,7 @@ __all__ = [
     "cross_entropy",
     "discounted_sum",
     "ensemble_mean",
+    "expected_soft_value",
     "explained_variance",
     "generalized_advantage",
     "hl_gauss",
@@ -39,8 +42,10 @@ __all__ = [
     "quantile_huber",
     "random_subset",
     "same_shape",
+    "smoothed_action",
     "soft_returns",
     "soft_value",
+    "straight_through_sample",
     "temperature_loss",
     "twin_minimum",
     "two_hot",
