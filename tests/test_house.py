@@ -36,7 +36,7 @@ def imports(path: Path):
             yield (rest[0] if rest else "pgkit") if top == "pgkit" else top
 
 
-BASES = ("base", "policy_base", "q_base", "soft_base")  # plumbing, no algorithm
+BASES = ("base", "policy_base", "actor_critic_base", "q_base", "soft_base")  # plumbing, no algorithm
 
 
 def outside(folder: str, path: Path):

@@ -1,6 +1,8 @@
 """Pure tensor maths: one idea a function, shapes checked, results unreduced."""
 
+from pgkit.functional.adaptation import adapted_coefficient
 from pgkit.functional.checks import is_flag, same_shape
+from pgkit.functional.conjugate_gradient import conjugate_gradient
 from pgkit.functional.discrete import expected_soft_value, straight_through_sample
 from pgkit.functional.distributional import (
     categorical_mean,
@@ -10,6 +12,7 @@ from pgkit.functional.distributional import (
     quantile_huber,
     two_hot,
 )
+from pgkit.functional.group_relative import group_relative
 from pgkit.functional.returns import discounted_sum, generalized_advantage
 from pgkit.functional.smoothing import smoothed_action
 from pgkit.functional.soft import (
@@ -21,26 +24,47 @@ from pgkit.functional.soft import (
     twin_minimum,
 )
 from pgkit.functional.subsets import random_subset
-from pgkit.functional.surrogates import approx_kl, clip_surrogate
+from pgkit.functional.surrogates import (
+    approx_kl,
+    clip_surrogate,
+    dual_clip_surrogate,
+    policy_gradient,
+    quadratic_surrogate,
+    ratio_surrogate,
+    rollback_surrogate,
+)
+from pgkit.functional.td_lambda import from_start, lambda_return, n_step_return
 from pgkit.functional.values import clipped_value_loss, explained_variance, value_loss
+from pgkit.functional.vtrace import vtrace
 
 __all__ = [
+    "adapted_coefficient",
     "approx_kl",
     "bootstrap_target",
     "categorical_mean",
     "categorical_projection",
     "clip_surrogate",
     "clipped_value_loss",
+    "conjugate_gradient",
     "cross_entropy",
     "discounted_sum",
+    "dual_clip_surrogate",
     "ensemble_mean",
     "expected_soft_value",
     "explained_variance",
+    "from_start",
     "generalized_advantage",
+    "group_relative",
     "hl_gauss",
     "is_flag",
+    "lambda_return",
+    "n_step_return",
+    "policy_gradient",
+    "quadratic_surrogate",
     "quantile_huber",
     "random_subset",
+    "ratio_surrogate",
+    "rollback_surrogate",
     "same_shape",
     "smoothed_action",
     "soft_returns",
@@ -50,4 +74,5 @@ __all__ = [
     "twin_minimum",
     "two_hot",
     "value_loss",
+    "vtrace",
 ]

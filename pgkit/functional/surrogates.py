@@ -8,6 +8,29 @@ from torch import Tensor
 from pgkit.functional.checks import same_shape
 
 
+def policy_gradient(log_prob: Tensor, advantage: Tensor) -> Tensor:
+    r"""The objective :math:`\log \pi(a|s)\, A`, whose gradient is the policy gradient (Sutton et al., 2000).
+
+    Args:
+        log_prob: any shape; the gradient flows through it alone.
+        advantage: same shape.
+
+    Returns:
+        Same shape, unreduced.
+    """
+    same_shape(log_prob=log_prob, advantage=advantage)
+    return log_prob * advantage.detach()
+
+
+def ratio_surrogate(log_ratio: Tensor, advantage: Tensor) -> Tensor:
+    r"""The importance-weighted objective :math:`r A` (Schulman et al., 2015, https://arxiv.org/abs/1502.05477, eq. 14).
+
+    Args and result as in :func:`clip_surrogate`.
+    """
+    same_shape(log_ratio=log_ratio, advantage=advantage)
+    return log_ratio.exp() * advantage
+
+
 def clip_surrogate(
     log_ratio: Tensor,
     advantage: Tensor,
@@ -32,6 +55,50 @@ def clip_surrogate(
     ratio = log_ratio.exp()
     clipped = ratio.clamp(1 - clip_low, 1 + (clip_low if clip_high is None else clip_high))
     return torch.minimum(ratio * advantage, clipped * advantage)
+
+
+def dual_clip_surrogate(
+    log_ratio: Tensor, advantage: Tensor, clip: float | Tensor = 0.2, bound: float | Tensor = 3.0
+) -> Tensor:
+    r"""The clipped surrogate, bounded below by :math:`c A` where :math:`A < 0` (Ye et al., 2020).
+
+    Without it a large ratio at a negative advantage makes an objective without bound (https://arxiv.org/abs/1912.09729,
+    eq. 5). ``bound`` is :math:`c > 1`; the other arguments and the result are as in :func:`clip_surrogate`.
+    """
+    objective = clip_surrogate(log_ratio, advantage, clip)
+    return torch.where(advantage < 0, torch.maximum(objective, bound * advantage), objective)
+
+
+def quadratic_surrogate(log_ratio: Tensor, advantage: Tensor, epsilon: float | Tensor = 0.2) -> Tensor:
+    r"""SPO's quadratic penalty in place of the clip (Xie et al., 2024, https://arxiv.org/abs/2401.16025).
+
+    .. math::
+        r A - \frac{|A|}{2 \epsilon} (r - 1)^2
+
+    The maximum over :math:`r` is at :math:`1 + \epsilon\, \text{sign}(A)`, and beyond it the gradient leads back. Args
+    and result as in :func:`clip_surrogate`.
+    """
+    same_shape(log_ratio=log_ratio, advantage=advantage)
+    ratio = log_ratio.exp()
+    return ratio * advantage - advantage.abs() / (2 * epsilon) * (ratio - 1).square()
+
+
+def rollback_surrogate(
+    log_ratio: Tensor, advantage: Tensor, epsilon: float | Tensor = 0.2, slope: float | Tensor = 0.3
+) -> Tensor:
+    r"""Truly PPO's rollback: beyond the clip the objective falls again.
+
+    Wang et al., 2019 (https://arxiv.org/abs/1903.07940).
+
+    .. math::
+        \min\big(r A,\ (\bar r - \alpha (r - \bar r)) A\big), \qquad \bar r = \text{clip}(r, 1 - \epsilon, 1 + \epsilon)
+
+    ``slope`` is :math:`\alpha`; 0 is the clip. The other arguments and the result are as in :func:`clip_surrogate`.
+    """
+    same_shape(log_ratio=log_ratio, advantage=advantage)
+    ratio = log_ratio.exp()
+    clipped = ratio.clamp(1 - epsilon, 1 + epsilon)
+    return torch.minimum(ratio * advantage, (clipped - slope * (ratio - clipped)) * advantage)
 
 
 def approx_kl(log_ratio: Tensor) -> Tensor:

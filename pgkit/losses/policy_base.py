@@ -5,14 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import Any
 
+import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torch.distributions import Distribution
+from torch.distributions import Distribution, kl_divergence
 from torchrl.modules.distributions.utils import sample_and_log_prob
 from torchrl.objectives.utils import ValueEstimators, dispatch_value_estimator
 
+from pgkit.functional import approx_kl, same_shape
 from pgkit.losses.base import Loss
 
 
@@ -20,8 +22,7 @@ class PolicyLoss(Loss):
     """Base of the losses of an actor and a state-value critic on on-policy data.
 
     It holds both networks as TorchRL losses do (``actor_network``, ``actor_network_params``, ...), names the keys,
-    and gives subclasses three verbs: :meth:`distribution`, :meth:`log_prob`, :meth:`value`. A subclass writes
-    ``forward`` and names its results in ``metrics``.
+    and gives subclasses verbs: :meth:`distribution`, :meth:`log_prob`, :meth:`log_ratio`, :meth:`kl`, :meth:`value`.
 
     Args:
         actor_network: probabilistic actor.
@@ -71,6 +72,46 @@ class PolicyLoss(Loss):
         """The policy's distribution at the batch's observations; the batch is left as it is."""
         with self.actor_network_params.to_module(self.actor_network):
             return self.actor_network.get_dist(batch.select(*self.actor_network.in_keys))
+
+    def log_prob(self, dist: Distribution, batch: TensorDictBase) -> Tensor:
+        """Log-probability of the batch's actions, ``[*B]``."""
+        return dist.log_prob(batch[self.tensor_keys.action])
+
+    def log_ratio(self, dist: Distribution, batch: TensorDictBase) -> Tensor:
+        r""":math:`\log \pi(a|s) - \log \pi_{old}(a|s)` of the batch's actions, ``[*B, 1]``."""
+        log_prob, old_log_prob = self.log_prob(dist, batch), batch[self.tensor_keys.sample_log_prob]
+        same_shape(log_prob=log_prob, old_log_prob=old_log_prob)
+        return (log_prob - old_log_prob).unsqueeze(-1)
+
+    def keep_distribution(self, batch: TensorDictBase) -> TensorDictBase:
+        """Writes the policy's distribution into the batch (``loc`` and ``scale``, or ``logits``), as of now."""
+        with torch.no_grad(), self.actor_network_params.to_module(self.actor_network):
+            out = self.actor_network.get_dist_params(batch.select(*self.actor_network.in_keys))
+        return batch.update(out.select(*self.distribution_keys))
+
+    @property
+    def distribution_keys(self) -> list[NestedKey]:
+        """Where :meth:`keep_distribution` writes and TorchRL's collectors do: the distribution's parameters."""
+        head: Any = self.actor_network
+        return list(head[-1].in_keys)
+
+    def kl(self, batch: TensorDictBase, dist: Distribution | None = None) -> Tensor:
+        r""":math:`KL(\pi_{old} \| \pi)` ``[*B]`` from the distribution kept in the batch to the present one.
+
+        In closed form where the distributions have one, otherwise estimated from the batch's actions.
+        """
+        dist = self.distribution(batch) if dist is None else dist
+        missing = [key for key in self.distribution_keys if key not in batch.keys(True)]
+        if missing:
+            raise KeyError(
+                f"the batch has no '{missing[0]}', a parameter of the distribution that acted: call "
+                "loss.keep_distribution(rollout) before the update"
+            )
+        old = self.actor_network.build_dist_from_params(batch.select(*self.distribution_keys))
+        try:
+            return kl_divergence(old, dist)
+        except NotImplementedError:
+            return approx_kl(self.log_ratio(dist, batch)).squeeze(-1)
 
     def value(self, batch: TensorDictBase) -> Tensor:
         """The critic's value of the batch's observations, ``[*B, 1]``."""
@@ -126,8 +167,3 @@ class PolicyLoss(Loss):
         if self._value_estimator is not None:
             accepted = {field.name for field in fields(self._value_estimator._AcceptedKeys)}
             self._value_estimator.set_keys(**{k: v for k, v in kwargs.items() if k in accepted})
-
-
-def standardize(x: Tensor) -> Tensor:
-    """Zero mean and unit standard deviation over all elements, which is what PPO does to a minibatch's advantage."""
-    return (x - x.mean()) / x.std().clamp_min(1e-6)

@@ -1,0 +1,103 @@
+"""PPO with an adaptive KL penalty (Schulman et al., 2017, https://arxiv.org/abs/1707.06347, section 4)."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule, dispatch
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+
+from pgkit.functional import adapted_coefficient, ratio_surrogate
+from pgkit.losses.actor_critic_base import ActorCriticLoss
+
+
+class KLPENPPOLoss(ActorCriticLoss):
+    r"""PPO with a KL penalty, a drop-in for TorchRL's loss of that name.
+
+    .. math::
+        L = -\frac1B \sum \big(r A - \beta\, KL(\pi_{old} \| \pi)\big)
+            + c_V \frac1B \sum (V - V^{target})^2 - c_H \frac1B \sum H[\pi]
+
+    The batch holds the parameters of :math:`\pi_{old}` (``loc`` and ``scale``, or ``logits``): TorchRL's collectors
+    write them, with pgkit's call ``loss.keep_distribution(rollout)`` first. The KL is in closed form where the
+    distributions have one.
+
+    With a ``controller``, :math:`\beta` is its to set, e.g. once a rollout as in the paper. Without one this loss
+    adapts :math:`\beta` in every call, as TorchRL's does. Defaults that differ from TorchRL's: squared error for the
+    value (there ``smooth_l1``), the advantage normalized in every minibatch (there it is not), entropy coefficient 0.
+
+    Args:
+        actor_network: probabilistic actor.
+        critic_network: value operator; None leaves the value loss out.
+        controller: holds ``beta``, a scalar tensor, e.g. :class:`pgkit.controllers.AdaptiveKL`; replaces the four
+            settings that follow.
+        dtarg: KL that :math:`\beta` aims at.
+        beta: :math:`\beta` at the start.
+        increment: factor of :math:`\beta` when the KL is above 1.5 times ``dtarg``.
+        decrement: factor of :math:`\beta` when the KL is below ``dtarg`` / 1.5.
+        entropy_coeff, critic_coeff, loss_critic_type, normalize_advantage, clip_value, entropy_bonus, separate_losses,
+            reduction: as in :class:`~pgkit.losses.ActorCriticLoss`.
+
+    Writes ``loss_objective``, ``loss_critic``, ``loss_entropy`` and the metrics ``entropy``, ``kl``, ``beta``,
+    ``explained_variance``.
+    """
+
+    _schedulable_buffers: ClassVar[frozenset[str]] = ActorCriticLoss._schedulable_buffers | {"beta"}
+
+    beta: Tensor
+
+    def __init__(
+        self,
+        actor_network: TensorDictModule,
+        critic_network: TensorDictModule | None = None,
+        *,
+        controller: nn.Module | None = None,
+        dtarg: float = 0.01,
+        beta: float = 1.0,
+        increment: float = 2.0,
+        decrement: float = 0.5,
+        entropy_coeff: float = 0.0,
+        critic_coeff: float | None = 1.0,
+        loss_critic_type: str = "l2",
+        normalize_advantage: bool = True,
+        clip_value: float | None = None,
+        entropy_bonus: bool = True,
+        separate_losses: bool = False,
+        reduction: str | None = None,
+    ) -> None:
+        super().__init__(
+            actor_network, critic_network, entropy_coeff=entropy_coeff, critic_coeff=critic_coeff,
+            loss_critic_type=loss_critic_type, normalize_advantage=normalize_advantage, clip_value=clip_value,
+            entropy_bonus=entropy_bonus, separate_losses=separate_losses, reduction=reduction,
+        )  # fmt: skip
+        self.controller = controller
+        self.dtarg, self.increment, self.decrement = dtarg, increment, decrement
+        if controller is None:
+            self.register_coeff_buffer("beta", beta)
+
+    def _read_keys(self) -> list[NestedKey]:
+        return [*super()._read_keys(), *self.distribution_keys]
+
+    def _writes(self) -> list[NestedKey]:
+        return ["loss_objective", *super()._writes(), "kl", "beta"]
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Losses and metrics of a batch ``[*B]`` with ``advantage`` ``[*B, 1]`` and the old distribution."""
+        batch = tensordict.copy()
+        advantage, dist = self.get_advantage(batch), self.distribution(batch)
+        kl = self.kl(batch, dist).unsqueeze(-1)
+        beta = (self.beta if self.controller is None else self.controller.beta).clone()
+        objective = ratio_surrogate(self.log_ratio(dist, batch), advantage) - beta * kl
+
+        out = TensorDict({"loss_objective": self.reduce(-objective, batch)})
+        self.add_entropy(out, dist, batch)
+        self.add_critic(out, batch)
+        out["kl"], out["beta"] = kl.detach().mean(), beta
+        if self.controller is None:
+            with torch.no_grad():
+                self.beta.copy_(adapted_coefficient(beta, out["kl"], self.dtarg, self.increment, self.decrement))
+        return out
