@@ -34,6 +34,14 @@ def test_probabilities_and_weights():
     torch.testing.assert_close(weight, torch.tensor([1.0, 0.5**0.5, 0.5, 1.0]))
 
 
+def test_errors_enter_with_eps_and_to_the_power_of_alpha():
+    sampler = data.Prioritized(alpha=0.5, eps=1.0)
+    sampler.begin(4)
+    sampler.write_back(torch.arange(3), torch.tensor([0.0, -3.0, 8.0]))
+    assert sampler.tree.values[:3].tolist() == [1.0, 2.0, 3.0]  # the roots of 0 + 1, 3 + 1, 8 + 1
+    assert sampler.largest == 3.0
+
+
 def test_new_frames_get_the_largest_priority_and_evicted_ones_are_never_drawn():
     sampler = data.Prioritized(alpha=1.0, eps=0.0)
     buffer = data.ReplayBuffer(envs.make("Pendulum-v1"), 10, sampler=sampler, n_steps=2, seed=0)
