@@ -15,9 +15,11 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from pgkit.compiling import compile_record, record
 from pgkit.envs import VectorEnv
+from pgkit.envs.vector import whole
 from pgkit.errors import UserError
 
-Act = Callable[[Tensor], tuple[Tensor, ...]]
+Act = Callable[..., tuple[Tensor, ...]]
+STATE = ("next", "recurrent_state")
 
 
 def output_keys(actor: TensorDictModuleBase) -> list[NestedKey]:
@@ -26,11 +28,25 @@ def output_keys(actor: TensorDictModuleBase) -> list[NestedKey]:
     if not samples:
         return list(actor.out_keys)
     log_probs: Any = actor.log_prob_keys
-    return [*samples, *[key for key in log_probs if key in actor.out_keys]]
+    return [*samples, *[key for key in (*log_probs, STATE) if key in actor.out_keys]]
 
 
-def trace(actor: TensorDictModuleBase, obs: Tensor, compile: bool = False) -> Act:
+def memory(actor: TensorDictModuleBase, num_envs: int) -> dict[str, Tensor]:
+    """What a recurrent actor reads besides the observation, at the start of an episode; nothing for any other."""
+    size = next((int(m.state_size) for m in actor.modules() if hasattr(m, "state_size")), 0)
+    start = {"is_init": torch.ones(num_envs, 1, dtype=torch.bool), "recurrent_state": torch.zeros(num_envs, size)}
+    return start if size else {}
+
+
+def trace(
+    actor: TensorDictModuleBase,
+    obs: Tensor,
+    compile: bool = False,
+    split: Callable[[Tensor], dict[str, Tensor]] = whole,
+) -> Act:
     """A function from observations of the shape of ``obs`` to the tensors at :func:`output_keys`.
+
+    A recurrent actor's function takes the entries of :func:`memory` too. ``split`` makes entries of ``obs``.
 
     It is the actor's own sequence of tensor operations, recorded once (``make_fx``) and called without TensorDict:
     the same numbers bit for bit, at about a quarter of the cost for a small network. ``compile`` hands the record to
@@ -40,27 +56,36 @@ def trace(actor: TensorDictModuleBase, obs: Tensor, compile: bool = False) -> Ac
     """
     keys = output_keys(actor)
 
-    def act(obs: Tensor) -> tuple[Tensor, ...]:
-        out = actor(TensorDict({"observation": obs}, batch_size=obs.shape[:1]))
+    remembered = memory(actor, len(obs))
+    inputs = [obs, *remembered.values()]
+
+    def act(obs: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
+        entries = split(obs) | dict(zip(remembered, state, strict=True))
+        out = actor(TensorDict(entries, batch_size=obs.shape[:1]))
         return tuple(out[key] for key in keys)
 
     with torch.no_grad(), torch.random.fork_rng(devices=[]), set_exploration_type(ExplorationType.RANDOM):
         try:
-            graph = record(act, [obs])
+            graph = record(act, inputs)
         except RuntimeError as error:
             if "proxy" not in str(error) and "trac" not in str(error):
                 raise
             return act
         if not compile:
             return graph.forward
-        return compile_record(graph, [obs])
+        return compile_record(graph, inputs)
 
 
 def random_actions(spec: TensorSpec, outputs: dict[NestedKey, Tensor]) -> Act:
-    """A policy that draws actions uniformly from ``spec``; its other outputs, shaped as ``outputs``, are NaN."""
-    others = {key: torch.full_like(x, torch.nan) for key, x in outputs.items() if key != "action"}
+    """A policy that draws actions uniformly from ``spec``; its other outputs, shaped as ``outputs``, are NaN.
 
-    def act(obs: Tensor) -> tuple[Tensor, ...]:
+    A recurrent state stays zero.
+    """
+    others = {
+        key: torch.full_like(x, 0.0 if key == STATE else torch.nan) for key, x in outputs.items() if key != "action"
+    }
+
+    def act(obs: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
         return tuple(spec.rand() if key == "action" else others[key] for key in outputs)
 
     return act
@@ -68,17 +93,22 @@ def random_actions(spec: TensorSpec, outputs: dict[NestedKey, Tensor]) -> Act:
 
 def example(env: VectorEnv, actor: TensorDictModuleBase) -> tuple[Tensor, ...]:
     """The actor's outputs for observations of zeros, checked against the environment's action spec."""
-    obs, spec = env.observation_spec["observation"].zero(), env.action_spec
-    data = TensorDict({"observation": obs}, batch_size=(env.num_envs,))
+    entries, spec = env.observation_spec.zero(), env.action_spec
+    data = TensorDict({**entries, **memory(actor, env.num_envs)}, batch_size=(env.num_envs,))
+    missing = [key for key in actor.in_keys if key not in data.keys(True)]
+    if missing:
+        raise UserError(
+            f"the actor reads '{missing[0]}', the environment observes {', '.join(map(str, entries.keys()))}: build "
+            "the actor from this environment; envs.make(..., flatten=False) keeps a Dict observation's entries apart"
+        )
     misfit = "the actor was built for another environment: build it from this one (modules.gaussian_actor(env))"
     with torch.no_grad(), torch.random.fork_rng(devices=[]):
         try:
             out = actor(data)
         except RuntimeError as error:
+            shapes = ", ".join(str(tuple(x.shape[1:])) for x in entries.values())
             reason = str(error.__cause__ or error).strip().splitlines()[-1]
-            raise UserError(
-                f"the actor cannot read observations of shape {tuple(obs.shape[1:])}; {misfit} [{reason}]"
-            ) from error
+            raise UserError(f"the actor cannot read observations of shape {shapes}; {misfit} [{reason}]") from error
     action = out["action"]
     if action.shape != spec.shape or action.dtype.is_floating_point != spec.dtype.is_floating_point:
         raise UserError(

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -10,8 +11,10 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from pgkit.collectors.policy import Act
+from pgkit.collectors.policy import STATE, Act
 from pgkit.envs import ArrayEnv
+from pgkit.envs.vector import whole
+from pgkit.errors import UserError
 
 Arrays = dict[NestedKey, np.ndarray]
 
@@ -19,10 +22,16 @@ Arrays = dict[NestedKey, np.ndarray]
 def allocate(steps: int, obs: np.ndarray, outputs: dict[NestedKey, Tensor]) -> Arrays:
     """Empty arrays ``[steps, N, ...]`` for a rollout; ``outputs`` are examples ``[N, ...]`` of the policy's results."""
     num_envs = len(obs)
+    recurrent: Arrays = {}
+    if STATE in outputs:
+        recurrent["recurrent_state"] = np.empty((steps, *outputs[STATE].shape), np.float32)
+        recurrent["is_init"] = np.empty((steps, num_envs, 1), bool)
+        recurrent["next", "is_init"] = np.zeros((steps, num_envs, 1), bool)
     flag = {("next", key): np.empty((steps, num_envs, 1), bool) for key in ("terminated", "truncated")}
     return {
         "observation": np.empty((steps, *obs.shape), np.float32),
         **{key: np.empty((steps, *x.shape), x.numpy().dtype) for key, x in outputs.items()},
+        **recurrent,
         ("next", "observation"): np.empty((steps, *obs.shape), np.float32),
         ("next", "reward"): np.empty((steps, num_envs, 1), np.float32),
         **flag,
@@ -48,6 +57,10 @@ def fill(arrays: Arrays, envs: ArrayEnv, act: Act, keys: Sequence[NestedKey], nu
     action = own["action"]
     padded = envs.obs if envs.num_envs == num_envs else np.zeros((num_envs, *envs.obs.shape[1:]), np.float32)
     policy_input = torch.from_numpy(padded)
+    inputs = [policy_input]
+    memory = _Memory(own, envs, num_envs, rows) if STATE in own else None
+    if memory is not None:
+        inputs += memory.inputs
     if (envs.step_count == 0).all():
         envs.reset()
     torch.default_generator.manual_seed(seed)  # torch.manual_seed costs 0.3 ms
@@ -55,15 +68,47 @@ def fill(arrays: Arrays, envs: ArrayEnv, act: Act, keys: Sequence[NestedKey], nu
         if padded is not envs.obs:
             padded[rows] = envs.obs
         obs[t] = envs.obs
-        for result, output in zip(results, act(policy_input), strict=True):
+        if memory is not None:
+            memory.recall(t)
+        for result, output in zip(results, act(*inputs), strict=True):
             result[t] = output.numpy()[rows]
         next_obs[t], reward[t], terminated[t], truncated[t] = envs.step(action[t])
         episode_reward[t], step_count[t] = envs.episode_reward, envs.step_count
+    if memory is not None:
+        memory.keep()
 
 
-def as_rollout(arrays: Arrays) -> TensorDictBase:
+class _Memory:
+    """A recurrent policy's state, from step to step; it begins at zero where an episode does, by ``is_init``."""
+
+    def __init__(self, own: Arrays, envs: ArrayEnv, num_envs: int, rows: slice) -> None:
+        self.envs, self.rows = envs, rows
+        self.is_init, self.states, self.next_states = own["is_init"][..., 0], own["recurrent_state"], own[STATE]
+        size = self.states.shape[-1]
+        if envs.memory is None:
+            envs.memory = np.zeros((envs.num_envs, size), np.float32)
+        self.all_init, self.all_states = np.zeros((num_envs, 1), bool), np.zeros((num_envs, size), np.float32)
+        self.inputs = [torch.from_numpy(self.all_init), torch.from_numpy(self.all_states)]
+
+    def recall(self, t: int) -> None:
+        """Lays out and stores what the policy reads at step ``t``."""
+        if t > 0:
+            self.envs.memory = self.next_states[t - 1]
+        self.is_init[t], self.states[t] = self.envs.fresh, self.envs.memory
+        self.all_init[self.rows, 0], self.all_states[self.rows] = self.is_init[t], self.states[t]
+
+    def keep(self) -> None:
+        """After the last step."""
+        self.envs.memory = self.next_states[-1].copy()
+
+
+def as_rollout(arrays: Arrays, split: Callable[[Tensor], dict[str, Tensor]] = whole) -> TensorDictBase:
     """The arrays ``[T, N, ...]`` as a TensorDict ``[N, T]``, without a copy, and ``("next", "done")``."""
-    tensors = {key: torch.from_numpy(array).transpose(0, 1) for key, array in arrays.items()}
+    tensors: dict[Any, Tensor] = {key: torch.from_numpy(array).transpose(0, 1) for key, array in arrays.items()}
+    now, after = split(tensors.pop("observation")), split(tensors.pop(("next", "observation")))
+    tensors = {**now, **tensors, **{("next", name): x for name, x in after.items()}}
+    if "action_mask" in now and not now["action_mask"].any(-1).all():
+        raise UserError("the environment's action_mask allows no action in some state: it must allow at least one")
     tensors["next", "done"] = tensors["next", "terminated"] | tensors["next", "truncated"]
     rollout = TensorDict({}, batch_size=tensors["next", "done"].shape[:2])
     for key, tensor in tensors.items():

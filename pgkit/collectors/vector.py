@@ -100,7 +100,7 @@ class VectorCollector:
                 fill(arrays, self.env.arrays, act, self._keys, self.env.num_envs, seed)
         self.frames += self.frames_per_batch
         self._rollouts += 1
-        return as_rollout(arrays)
+        return as_rollout(arrays, self.env.split)
 
     def state_dict(self) -> dict[str, Any]:
         """Counters, and every environment's state (see :class:`~pgkit.envs.ArrayEnv`)."""
@@ -132,6 +132,7 @@ class VectorCollector:
         tensors = [store[name].data_ptr() for store, name in self._tensors]
         if self._act is None or tensors != self._traced:
             start = time.perf_counter()
-            self._act, self._traced = trace(self.actor, torch.from_numpy(self.env.arrays.obs), self._compile), tensors
+            obs = torch.from_numpy(self.env.arrays.obs)
+            self._act, self._traced = trace(self.actor, obs, self._compile, self.env.split), tensors
             self.compile_seconds += time.perf_counter() - start
         return self._act

@@ -6,12 +6,13 @@ import copy
 import signal
 import traceback
 import weakref
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from itertools import pairwise
 from multiprocessing.connection import Connection
 from typing import Any, NamedTuple
 
 import cloudpickle
+import numpy as np
 import torch
 import torch.multiprocessing as mp
 from tensordict.nn import TensorDictModuleBase
@@ -48,7 +49,7 @@ class Workers:
         bounds: Sequence[int] | None = None,
     ) -> None:
         self._actor = copy.deepcopy(actor).requires_grad_(False).share_memory()
-        obs = env.observation_spec["observation"].zero().numpy()
+        obs = np.zeros((env.num_envs, *env.observation_shape), np.float32)
         shared = {k: torch.from_numpy(x).share_memory_() for k, x in allocate(steps, obs, outputs).items()}
         self._arrays: Arrays = {key: tensor.numpy() for key, tensor in shared.items()}
         context = mp.get_context("spawn")
@@ -59,7 +60,7 @@ class Workers:
             ours, theirs = context.Pipe()
             share = _Share(
                 cloudpickle.dumps(env.make_env), first, end - first, env.num_envs, env.seed, env.action_spec,
-                self._actor, outputs, shared, compile,
+                self._actor, outputs, shared, compile, env.split,
             )  # fmt: skip
             process = context.Process(target=_serve, args=(theirs, share), daemon=True)
             process.start()
@@ -90,13 +91,15 @@ class Workers:
         parts = self._ask([("state", None)] * len(self.pipes))
         history = [x for part in parts for x in part["history"]]
         episode = [x for part in parts for x in part["episode"]]
-        return {"seed": parts[0]["seed"], "episode": episode, "history": history}
+        state = {"seed": parts[0]["seed"], "episode": episode, "history": history}
+        return state | {"memory": np.concatenate([part["memory"] for part in parts])} if "memory" in parts[0] else state
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Gives every process its share of :meth:`state_dict`."""
         start = self._bounds[0]
         cuts = [slice(a - start, b - start) for a, b in pairwise(self._bounds)]
-        parts = [{**state, "episode": state["episode"][c], "history": state["history"][c]} for c in cuts]
+        keys = [key for key in ("episode", "history", "memory") if key in state]
+        parts = [{"seed": state["seed"], **{key: state[key][c] for key in keys}} for c in cuts]
         self._ask([("load", part) for part in parts])
 
     def _ask(self, requests: list[Any]) -> list[Any]:
@@ -140,6 +143,7 @@ class _Share(NamedTuple):
     outputs: dict[NestedKey, Tensor]
     shared: dict[NestedKey, Tensor]
     compile: bool
+    split: Callable[[Tensor], dict[str, Tensor]]
 
 
 def _serve(pipe: Connection, share: _Share) -> None:
@@ -148,7 +152,7 @@ def _serve(pipe: Connection, share: _Share) -> None:
     try:
         torch.set_num_threads(1)
         envs = ArrayEnv(cloudpickle.loads(share.make_env), share.count, share.seed, share.first)
-        act = trace(share.actor, torch.zeros(share.num_envs, *envs.obs.shape[1:]), share.compile)
+        act = trace(share.actor, torch.zeros(share.num_envs, *envs.obs.shape[1:]), share.compile, share.split)
         random_act = random_actions(share.action_spec, share.outputs)
         arrays = {key: tensor.numpy() for key, tensor in share.shared.items()}
         pipe.send((None, None))

@@ -9,6 +9,8 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+_ARRAYS = (spaces.Box, spaces.MultiBinary)  # whose observations are arrays
+
 
 def episode_seed(seed: int, index: int, episode: int) -> int:
     """Seed of one episode: a function of the run's seed, the environment's index and the episode's number."""
@@ -34,6 +36,9 @@ class ArrayEnv:
         obs: ``[N, *obs]``, the observations to act on next.
         episode_reward: float64 ``[N]``, undiscounted return so far of the episode the last step belonged to.
         step_count: int64 ``[N]``, its length so far.
+        fresh: bool ``[N]``, the episode was begun and has not been stepped since.
+        memory: float32 ``[N, size]``, a recurrent policy's state, kept here so that it is saved with its episode; None
+            for other policies.
     """
 
     def __init__(self, make_env: Callable[[], gym.Env], num_envs: int, seed: int = 0, first: int = 0) -> None:
@@ -46,6 +51,7 @@ class ArrayEnv:
         self._reward = np.zeros(num_envs, np.float32)
         self._terminated = np.zeros(num_envs, bool)
         self._truncated = np.zeros(num_envs, bool)
+        self.memory: np.ndarray | None = None
         self.restart(seed)
 
     def restart(self, seed: int) -> None:
@@ -53,7 +59,7 @@ class ArrayEnv:
         self.seed = seed
         self.episode_reward = np.zeros(self.num_envs)
         self.step_count = np.zeros(self.num_envs, np.int64)
-        self._fresh = np.zeros(self.num_envs, bool)  # reset, and not stepped since
+        self.fresh = np.zeros(self.num_envs, bool)
         self._episode = np.full(self.num_envs, -1)
         self._history: list[list[Any]] = [[] for _ in range(self.num_envs)]
 
@@ -61,13 +67,13 @@ class ArrayEnv:
         self._episode[i] += 1
         seed = episode_seed(self.seed, self.first + i, int(self._episode[i]))
         self._write(self.obs[i], self.envs[i].reset(seed=seed)[0])
-        self._fresh[i] = True
+        self.fresh[i] = True
         self._history[i] = []
 
     def reset(self, mask: np.ndarray | None = None) -> np.ndarray:
         """Starts a new episode where ``mask`` (``[N]``, all by default) is set, unless one has just started."""
         for i in range(self.num_envs) if mask is None else np.flatnonzero(mask):
-            if not self._fresh[i]:
+            if not self.fresh[i]:
                 self._begin(i)
         return self.obs
 
@@ -77,10 +83,10 @@ class ArrayEnv:
         Returns ``next_obs [N, *obs]``, ``reward [N]``, ``terminated [N]``, ``truncated [N]``: the same arrays at
         every call, overwritten by the next.
         """
-        if self._fresh.any():
-            self.episode_reward[self._fresh] = 0.0
-            self.step_count[self._fresh] = 0
-            self._fresh[:] = False
+        if self.fresh.any():
+            self.episode_reward[self.fresh] = 0.0
+            self.step_count[self.fresh] = 0
+            self.fresh[:] = False
         actions = self._to_env(actions)
         for i, env in enumerate(self.envs):
             obs, reward, terminated, truncated, _ = env.step(actions[i])
@@ -99,11 +105,12 @@ class ArrayEnv:
     def state_dict(self) -> dict[str, Any]:
         """Episode numbers and the actions taken since each episode began."""
         history = [np.array(actions) for actions in self._history]
-        return {"seed": self.seed, "episode": self._episode.copy(), "history": history}
+        state = {"seed": self.seed, "episode": self._episode.copy(), "history": history}
+        return state if self.memory is None else state | {"memory": self.memory.copy()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restores every environment by replaying the actions of its current episode."""
-        self.seed = state["seed"]
+        self.seed, self.memory = state["seed"], state.get("memory")
         for i, env in enumerate(self.envs):
             self._episode[i] = state["episode"][i] - 1
             self._begin(i)
@@ -113,7 +120,7 @@ class ArrayEnv:
                 self._write(self.obs[i], obs)
                 self.episode_reward[i] += np.float32(reward)
                 self._history[i].append(action)
-                self._fresh[i] = False
+                self.fresh[i] = False
 
     def close(self) -> None:
         for env in self.envs:
@@ -134,8 +141,8 @@ def _observation_writer(space: gym.Space) -> tuple[Callable[[np.ndarray, Any], N
 
         def write(row: np.ndarray, obs: Any) -> None:
             row[...] = obs
-    elif isinstance(space, spaces.Dict) and all(isinstance(s, spaces.Box) for s in space.spaces.values()):
-        ends = np.cumsum([int(np.prod(s.shape)) for s in space.spaces.values()]).tolist()
+    elif isinstance(space, spaces.Dict) and all(isinstance(s, _ARRAYS) for s in space.spaces.values()):
+        ends = np.cumsum([int(np.prod(s.shape or 1)) for s in space.spaces.values()]).tolist()
         slices = [(k, slice(a, b)) for k, a, b in zip(space.spaces, [0, *ends], ends, strict=False)]
 
         def write(row: np.ndarray, obs: Any) -> None:

@@ -22,6 +22,7 @@ def make(
     seed: int = 0,
     workers: int = 1,
     action_repeat: int = 1,
+    flatten: bool = True,
     **kwargs: Any,
 ) -> VectorEnv:
     """Makes a vector of environments.
@@ -33,11 +34,13 @@ def make(
         seed: seed of the whole vector; environment ``i`` gets its own stream.
         workers: processes that share the environments when a :class:`~pgkit.collectors.VectorCollector` collects.
         action_repeat: steps of the simulator for each action; a frame is then one decision, its reward their sum.
+        flatten: a Dict observation becomes one vector, ``observation``; False keeps its entries apart, each under its
+            own name: for one encoder per entry (:func:`pgkit.modules.dict_encoder`) and for action masks.
         **kwargs: passed to ``gymnasium.make``, or to the dm_control task.
 
     Raises:
         UserError: the id is unknown (the message has the nearest names), a package is missing (it has the
-            install line), or there are more workers than environments.
+            install line), there are more workers than environments, or there is no Dict to keep apart.
     """
     if num_envs < 1 or workers < 1 or workers > num_envs:
         raise UserError(
@@ -47,7 +50,7 @@ def make(
     make_env = partial(make_one, env_id, **kwargs) if isinstance(env_id, str) else env_id
     if action_repeat > 1:
         make_env = partial(_repeat, make_env, action_repeat)
-    env = VectorEnv(make_env, num_envs, seed, workers)
+    env = VectorEnv(make_env, num_envs, seed, workers, flatten)
     env.env_id = env_id if isinstance(env_id, str) else getattr(env_id, "__qualname__", type(env_id).__name__)
     if action_repeat > 1:
         env.env_id += f" (action repeat {action_repeat})"

@@ -11,10 +11,12 @@ import numpy as np
 import torch
 from gymnasium import spaces
 from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite, MultiCategorical, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
 from pgkit.envs.arrays import ArrayEnv, observation_shape
+from pgkit.envs.layout import Layout, layout
 
 
 class VectorEnv(EnvBase):
@@ -30,18 +32,30 @@ class VectorEnv(EnvBase):
         num_envs: number of environments.
         seed: every episode's seed is derived from it.
         workers: processes that collect with this environment (1: the calling process).
+        flatten: False keeps the entries of a Dict observation apart.
+
+    Attributes:
+        observation_shape: shape of one observation in :attr:`arrays`, where a Dict is always flat.
+        split: from those to the entries of a TensorDict, ``{"observation": ...}`` or, not flattened, the Dict's own.
     """
 
     env_id: str = "unnamed environment"
 
-    def __init__(self, make_env: Callable[[], gym.Env], num_envs: int = 1, seed: int = 0, workers: int = 1) -> None:
+    def __init__(
+        self, make_env: Callable[[], gym.Env], num_envs: int = 1, seed: int = 0, workers: int = 1, flatten: bool = True
+    ) -> None:
         super().__init__(device=None, batch_size=torch.Size([num_envs]))
         self.make_env, self.num_envs, self.seed, self.workers = make_env, num_envs, seed, workers
         probe = make_env()
-        shape = observation_shape(probe.observation_space)
-        self.observation_spec = Composite(
-            observation=Unbounded((num_envs, *shape), dtype=torch.float32), shape=(num_envs,)
+        self.observation_shape = observation_shape(probe.observation_space)
+        self.split: Layout | Callable[[Tensor], dict[str, Tensor]] = (
+            whole if flatten else layout(probe.observation_space)
         )
+        if isinstance(self.split, Layout):
+            self.observation_spec = self.split.spec(num_envs)
+        else:
+            spec = Unbounded((num_envs, *self.observation_shape), dtype=torch.float32)
+            self.observation_spec = Composite(observation=spec, shape=(num_envs,))
         self.action_spec = action_spec(probe.action_space, num_envs)
         self.reward_spec = Unbounded((num_envs, 1), dtype=torch.float32)
         flag = Categorical(2, shape=(num_envs, 1), dtype=torch.bool)
@@ -56,13 +70,13 @@ class VectorEnv(EnvBase):
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
         obs = self.arrays.reset(None if mask is None else mask.reshape(self.num_envs).numpy())
-        return TensorDict({"observation": torch.from_numpy(obs.copy())}, batch_size=self.batch_size)
+        return TensorDict(self.split(torch.from_numpy(obs.copy())), batch_size=self.batch_size)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         next_obs, reward, terminated, truncated = self.arrays.step(tensordict["action"].numpy())
         return TensorDict(
             {
-                "observation": torch.from_numpy(next_obs.copy()),
+                **self.split(torch.from_numpy(next_obs.copy())),
                 "reward": torch.from_numpy(reward.copy()).unsqueeze(-1),
                 "terminated": torch.from_numpy(terminated.copy()).unsqueeze(-1),
                 "truncated": torch.from_numpy(truncated.copy()).unsqueeze(-1),
@@ -83,6 +97,11 @@ class VectorEnv(EnvBase):
     def close(self, *, raise_if_closed: bool = True) -> None:
         self.close_arrays()
         super().close(raise_if_closed=raise_if_closed)
+
+
+def whole(obs: Tensor) -> dict[str, Tensor]:
+    """An observation of one entry."""
+    return {"observation": obs}
 
 
 def action_spec(space: gym.Space, num_envs: int) -> TensorSpec:

@@ -11,6 +11,7 @@ from pgkit.modules.exploration import GaussianExploration, OrnsteinUhlenbeck
 from pgkit.modules.mlp import mlp
 from pgkit.modules.normalizers import ObsNormalizer, ReturnScale
 from pgkit.modules.q_values import QValue, q_value
+from pgkit.modules.recurrent import gru, lstm
 from pgkit.modules.values import state_value
 
 __all__ = [
@@ -31,6 +32,8 @@ __all__ = [
     "discrete_q_value",
     "ensemble_mlp",
     "gaussian_actor",
+    "gru",
+    "lstm",
     "mlp",
     "q_value",
     "simba",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -33,7 +34,7 @@ def categorical_actor(
     ``[n]``, for MultiDiscrete the masks of all choices side by side), actions that it forbids have probability 0, and
     their logits no gradient. Arguments as in :func:`gaussian_actor`.
     """
-    spec = env.action_spec_unbatched
+    spec: Any = env.action_spec_unbatched
     several = isinstance(spec, MultiCategoricalSpec)
     if spec.dtype.is_floating_point or not (several or hasattr(spec.space, "n")):
         raise UserError(
@@ -61,7 +62,7 @@ class MaskedHead(nn.Module):
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
         logits = self.head(x)
-        return logits.masked_fill(~mask, torch.finfo(logits.dtype).min)
+        return logits.masked_fill(~mask.bool(), torch.finfo(logits.dtype).min)
 
 
 class MultiCategorical(Independent):

@@ -1,6 +1,6 @@
 """Evaluation: whole episodes, deterministic actions, the same number from every env slot."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
@@ -10,6 +10,8 @@ from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from pgkit.run.seeding import preserved_rng
+
+Entries = Mapping[str, torch.Tensor]
 
 
 @contextmanager
@@ -26,13 +28,41 @@ def _evaluating(policy: torch.nn.Module) -> Iterator[None]:
             part.training = mode
 
 
+class Acting:
+    """A policy on plain arrays; a recurrent one remembers from call to call.
+
+    Args:
+        policy: a TensorDict actor.
+        split: from observations ``[N, *obs]`` to the entries that it reads; by default all is ``observation``.
+    """
+
+    def __init__(self, policy: torch.nn.Module, split: Callable[[torch.Tensor], Entries] | None = None) -> None:
+        self.policy, self.split = policy, split or (lambda obs: {"observation": obs})
+        self.size = next((int(part.state_size) for part in policy.modules() if hasattr(part, "state_size")), 0)
+        self.state: torch.Tensor | None = None
+
+    def __call__(self, obs: np.ndarray, fresh: np.ndarray, deterministic: bool = True) -> np.ndarray:
+        """Actions ``[N, *action]`` for ``obs [N, *obs]``; ``fresh [N]``: an episode begins here."""
+        return self.on(self.split(torch.as_tensor(obs)), fresh, deterministic)
+
+    def on(self, entries: Entries, fresh: np.ndarray, deterministic: bool = True) -> np.ndarray:
+        """The same for entries as the policy reads them."""
+        device = next((p.device for p in self.policy.parameters()), torch.device("cpu"))
+        batch = TensorDict(dict(entries), [len(fresh)]).to(device)
+        if self.size:
+            batch["is_init"] = torch.as_tensor(fresh, device=device).unsqueeze(-1)
+            start = torch.zeros(len(fresh), self.size, device=device)
+            batch["recurrent_state"] = start if self.state is None else self.state
+        kind = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
+        with torch.no_grad(), set_exploration_type(kind):
+            out = self.policy(batch)
+        self.state = out.get(("next", "recurrent_state"), None)
+        return out["action"].cpu().numpy()
+
+
 def act(policy: torch.nn.Module, obs: np.ndarray, deterministic: bool = True) -> np.ndarray:
-    """Actions ``[N, *action]`` for observations ``[N, *obs]``, without gradients."""
-    device = next((p.device for p in policy.parameters()), torch.device("cpu"))
-    batch = TensorDict({"observation": torch.as_tensor(obs, device=device)}, [len(obs)], device=device)
-    kind = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
-    with torch.no_grad(), set_exploration_type(kind):
-        return policy(batch)["action"].cpu().numpy()
+    """Actions ``[N, *action]`` for the first observations of episodes, ``[N, *obs]``, without gradients."""
+    return Acting(policy)(obs, np.ones(len(obs), bool), deterministic)
 
 
 def play(policy: torch.nn.Module, env: Any, episodes: int) -> tuple[np.ndarray, np.ndarray]:
@@ -45,15 +75,17 @@ def play(policy: torch.nn.Module, env: Any, episodes: int) -> tuple[np.ndarray, 
         policy: a TensorDict actor that reads ``observation`` and writes ``action``.
         env: has ``.arrays``: ``reset()``, ``step(action)``, ``obs``, ``episode_reward``, ``step_count``.
     """
-    arrays = env.arrays
+    arrays, act = env.arrays, Acting(policy, getattr(env, "split", None))
     with preserved_rng(), _evaluating(policy):
         obs = arrays.reset()
         slots = len(obs)
         share = [episodes // slots + (slot < episodes % slots) for slot in range(slots)]
+        fresh = np.ones(slots, bool)
         finished: list[list[tuple[float, int]]] = [[] for _ in range(slots)]
         while any(len(done) < wanted for done, wanted in zip(finished, share, strict=True)):
-            _, _, terminated, truncated = arrays.step(act(policy, arrays.obs))
-            for slot in np.flatnonzero(terminated | truncated):
+            _, _, terminated, truncated = arrays.step(act(arrays.obs, fresh))
+            fresh = terminated | truncated
+            for slot in np.flatnonzero(fresh):
                 if len(finished[slot]) < share[slot]:
                     finished[slot].append((float(arrays.episode_reward[slot]), int(arrays.step_count[slot])))
     flat = [episode for slot in finished for episode in slot]

@@ -1,6 +1,6 @@
 """A trained policy, loaded from a run directory, on plain NumPy."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -11,7 +11,7 @@ import torch
 from pgkit.errors import UserError
 from pgkit.run import checkpoint
 from pgkit.run.directory import read_config
-from pgkit.run.evaluate import act
+from pgkit.run.evaluate import Acting
 
 Which = Literal["best", "latest"]
 
@@ -20,29 +20,48 @@ Which = Literal["best", "latest"]
 class Policy:
     """A policy with its observation normalizer, and the env it was trained for.
 
-    ``low`` and ``high`` are the action bounds ``[*action]``, None for discrete actions.
+    ``low`` and ``high`` are the action bounds ``[*action]``, None for discrete actions. ``observation_shape`` is a
+    mapping from names to shapes where the policy reads the entries of a Dict.
     """
 
     actor: torch.nn.Module
     make_env: Callable[..., Any]
-    observation_shape: tuple[int, ...]
+    observation_shape: tuple[int, ...] | dict[str, tuple[int, ...]]
     low: np.ndarray | None
     high: np.ndarray | None
     frames: int = 0
 
-    def predict(self, obs: np.ndarray, deterministic: bool = True) -> np.ndarray:
+    def __post_init__(self) -> None:
+        self._acting = Acting(self.actor)
+        self._begins = True
+
+    def reset(self) -> None:
+        """An episode begins at the next :meth:`predict`: a recurrent policy forgets. No other needs it."""
+        self._acting.state, self._begins = None, True
+
+    def predict(self, obs: Any, deterministic: bool = True) -> np.ndarray:
         """Action for one observation ``[*obs]``, or actions ``[N, *action]`` for a batch ``[N, *obs]``.
 
-        Continuous actions are clipped to the env's bounds. A wrong shape is a UserError.
+        Where the policy reads the entries of a Dict, ``obs`` is a mapping from their names to arrays. Continuous
+        actions are clipped to the env's bounds. A wrong shape is a UserError.
         """
-        obs = np.asarray(obs, dtype=np.float32)
-        single = obs.shape == self.observation_shape
-        if not single and obs.shape[1:] != self.observation_shape:
-            want = list(self.observation_shape)
-            raise UserError(
-                f"predict got an observation of shape {list(obs.shape)}; the policy takes {want} or a batch"
-            )
-        action = act(self.actor, obs[None] if single else obs, deterministic)
+        shapes = self.observation_shape
+        shapes = shapes if isinstance(shapes, dict) else {"observation": shapes}
+        given = obs if isinstance(obs, Mapping) else {"observation": obs}
+        entries, single = {}, False
+        for name, shape in shapes.items():
+            if name not in given:
+                raise UserError(f"predict got {', '.join(given)}; the policy takes the entries {', '.join(shapes)}")
+            x = np.asarray(given[name], dtype=np.float32)
+            single = x.shape == shape
+            if not single and x.shape[1:] != shape:
+                raise UserError(
+                    f"predict got an {name} of shape {list(x.shape)}; the policy takes {list(shape)} or a batch"
+                )
+            entries[name] = torch.from_numpy(x[None] if single else x)
+        fresh = np.full(len(next(iter(entries.values()))), self._begins)
+        action = self._acting.on(entries, fresh, deterministic)
+        self._begins = False
         if self.low is not None and self.high is not None:
             action = np.clip(action, self.low, self.high)
         return action[0] if single else action
@@ -50,10 +69,11 @@ class Policy:
 
 def describe_env(env: Any) -> dict[str, Any]:
     """What :class:`Policy` must know of an env: the observation's shape and the action's bounds."""
-    space = env.action_spec_unbatched.space
+    space, spec = env.action_spec_unbatched.space, env.observation_spec_unbatched
+    shapes = {name: tuple(spec[name].shape) for name in spec.keys()}
     low, high = getattr(space, "low", None), getattr(space, "high", None)
     return {
-        "observation_shape": tuple(env.observation_spec_unbatched["observation"].shape),
+        "observation_shape": shapes["observation"] if list(shapes) == ["observation"] else shapes,
         "low": None if low is None else low.cpu().numpy(),
         "high": None if high is None else high.cpu().numpy(),
     }
