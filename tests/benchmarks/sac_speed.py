@@ -10,11 +10,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
+from statistics import median
 from typing import Any
 
 import contest
 import torch
 import tyro
+from tensordict import TensorDict
 
 ENV_ID, BATCH, WIDTH, OBSERVATION, ACTION = "HalfCheetah-v5", 256, 256, 17, 6
 RANDOM_FRAMES, CHUNK, BUFFER = 1000, 500, 1_000_000
@@ -28,23 +30,35 @@ class Options(contest.Options):
     warmup: int = RANDOM_FRAMES + 1000
 
 
-def pgkit(seed: int) -> Iterator[int]:
-    """pgkit through its public API, one frame and one update in turn."""
-    from pgkit import collectors, data, envs, losses, modules, updates
+def agent(seed: int, stored: int = 0, sampler: Any = None) -> tuple[Any, Any, Any]:
+    """pgkit's environment, actor and update, with so many made-up frames in the replay buffer."""
+    from pgkit import data, envs, losses, modules, updates
 
     torch.manual_seed(seed)
     env = envs.make(ENV_ID, seed=seed)
     actor, critics = modules.tanh_normal_actor(env, (WIDTH, WIDTH)), modules.q_value(env, 2, (WIDTH, WIDTH))
     loss = losses.SACLoss(actor, critics, gamma=0.99)
-    update = updates.OffPolicyUpdate(
-        loss,
-        data.ReplayBuffer(env, BUFFER),
-        torch.optim.Adam(loss.parameters(), lr=3e-4),
-        batch_size=BATCH,
-        learning_starts=RANDOM_FRAMES,
-        tau=0.005,
-        compile="on",
-    )
+    buffer = data.ReplayBuffer(env, BUFFER, sampler=sampler)
+    for _ in range(stored // CHUNK):
+        buffer.extend(frames(CHUNK))
+    optimizer = torch.optim.Adam(loss.parameters(), lr=3e-4)
+    settings: Any = {"batch_size": BATCH, "learning_starts": RANDOM_FRAMES, "tau": 0.005, "compile": "on"}
+    return env, actor, updates.OffPolicyUpdate(loss, buffer, optimizer, **settings)
+
+
+def frames(steps: int) -> TensorDict:
+    """One environment's made-up frames ``[1, steps]``, one episode."""
+    obs, flag = torch.randn(1, steps + 1, OBSERVATION), torch.zeros(1, steps, 1, dtype=torch.bool)
+    after = {"observation": obs[:, 1:], "reward": torch.randn(1, steps, 1), "done": flag, "terminated": flag}
+    now = {"observation": obs[:, :-1], "action": torch.rand(1, steps, ACTION) * 2 - 1}
+    return TensorDict({**now, "next": after}, [1, steps])
+
+
+def pgkit(seed: int, stored: int = 0) -> Iterator[int]:
+    """pgkit through its public API, one frame and one update in turn."""
+    from pgkit import collectors
+
+    env, actor, update = agent(seed, stored)
     collector = collectors.VectorCollector(env, actor, frames_per_batch=1, init_random_frames=RANDOM_FRAMES)
     for rollout in collector:
         update(rollout)
@@ -140,8 +154,36 @@ def floor(threads: int) -> tuple[float, float]:
     return contest.milliseconds(update, calls=300, warmup=50), gflop
 
 
+def replay(threads: int, prioritized: bool) -> dict[str, float]:
+    """Milliseconds of one frame's replay and update: the write, the draw, the step with its gather and without."""
+    from pgkit import data, updates
+
+    torch.set_num_threads(threads)
+    _, _, update = agent(0, 20_000, data.Prioritized() if prioritized else None)
+    frame, buffer = frames(1), update.buffer
+    update.train(1)
+    whole = update._steps[True]
+    index = buffer.sample_index(BATCH)[0]
+    batch = update._batches.gather(buffer.data, index)
+    loss, optimizer = update.loss, update.optimizer
+    bare = updates.GradientStep(
+        loss, optimizer, whole.names[:-1], after=update._average, gather=lambda data, _: data, compile=True
+    )
+    bare(batch, index)
+    times: dict[str, list[float]] = {"write": [], "draw": [], "step": [], "step without gather": []}
+    for _ in range(10):
+        times["write"].append(contest.milliseconds(lambda: buffer.extend(frame), calls=100))
+        times["draw"].append(contest.milliseconds(lambda: buffer.sample_index(BATCH), calls=100))
+        times["step"].append(contest.milliseconds(lambda: whole(buffer.data, index), calls=100))
+        times["step without gather"].append(contest.milliseconds(lambda: bare(batch, index), calls=100))
+    result = {name: median(values) for name, values in times.items()}
+    result["memory, MB"] = sum(x.numel() * x.element_size() for x in buffer.data.values(True, True)) / 1e6
+    return result
+
+
 CONTENDERS = {
     "pgkit": contest.Contender(pgkit, "pgkit", "one frame, one update"),
+    "pgkit-1M": contest.Contender(partial(pgkit, stored=BUFFER), "pgkit", "as above, with a million frames stored"),
     "sb3": contest.Contender(sb3, "stable_baselines3", "train_freq=1, gradient_steps=1"),
     "sbx": contest.Contender(sbx, "sbx", "train_freq=1, gradient_steps=1, JAX"),
     "torchrl": contest.Contender(
@@ -163,4 +205,9 @@ if __name__ == "__main__":
         end=" ",
     )
     print(f"(before and after the rounds): at most {most:.0f} updates/s")
-    contest.write(options.json, {**result, "floor_ms": floors, "gflop": gflop})
+    replays = {name: replay(2, name == "prioritized") for name in ("uniform", "prioritized")}
+    for name, ms in replays.items():
+        total = ms["write"] + ms["draw"] + ms["step"]
+        share = (total - ms["step without gather"]) / total
+        print(f"replay, {name}: {share:.1%} of a frame;", ", ".join(f"{part} {x:.3f}" for part, x in ms.items()))
+    contest.write(options.json, {**result, "floor_ms": floors, "gflop": gflop, "replay_ms": replays})
