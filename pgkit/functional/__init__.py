@@ -19,7 +19,6 @@ from pgkit.functional.soft import (
     bootstrap_target,
     ensemble_mean,
     soft_returns,
-    soft_value,
     temperature_loss,
     twin_minimum,
 )
@@ -68,7 +67,6 @@ __all__ = [
     "same_shape",
     "smoothed_action",
     "soft_returns",
-    "soft_value",
     "straight_through_sample",
     "temperature_loss",
     "twin_minimum",

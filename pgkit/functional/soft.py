@@ -41,24 +41,6 @@ def soft_returns(atoms: Tensor, log_prob: Tensor, alpha: float | Tensor) -> Tens
     return atoms - alpha * log_prob.unsqueeze(-1)
 
 
-def soft_value(q: Tensor, log_prob: Tensor, alpha: float | Tensor) -> Tensor:
-    r"""Value of a state under entropy regularization, :math:`\min_i Q_i(s, a) - \alpha \log \pi(a|s)`, from one sample.
-
-    Haarnoja et al., 2018 (https://arxiv.org/abs/1812.05905, eq. 3), with the least of several critics.
-
-    Args:
-        q: ``[*B, critics]``, the critics' values of an action drawn from the policy.
-        log_prob: ``[*B]``, that action's log-probability.
-        alpha: temperature.
-
-    Returns:
-        ``[*B]``.
-    """
-    value = twin_minimum(q)
-    same_shape(value=value, log_prob=log_prob)
-    return value - alpha * log_prob
-
-
 def bootstrap_target(
     reward: Tensor,
     next_value: Tensor,

@@ -52,8 +52,8 @@ class CrossQLoss(SoftQLoss):
 
         with torch.no_grad():
             next_action, next_log_prob = self.act(batch["next"], self.actor_network_params)
-        keys = self.qvalue_network.in_keys
-        both = torch.cat([batch.select(*keys, strict=False), batch["next"].select(*keys, strict=False)])
+        keys = [key for key in self.qvalue_network.in_keys if key != self.tensor_keys.action]
+        both = torch.cat([batch.select(*keys), batch["next"].select(*keys)])
         action = torch.cat([batch[self.tensor_keys.action], next_action])
         returns, next_returns = self.returns(both, action, self.qvalue_network_params).chunk(2)
 

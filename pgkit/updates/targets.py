@@ -21,7 +21,10 @@ def target_pairs(loss: nn.Module) -> list[tuple[Tensor, Tensor]]:
         if name.startswith("target_") and name.endswith("_params"):
             source = getattr(loss, name.removeprefix("target_"))
             pairs += [(target.get(key).data, source.get(key)) for key in target.keys(True, True)]
-    return [(target, source) for target, source in pairs if target.data_ptr() != source.data_ptr()]
+    apart = [(target, source) for target, source in pairs if target.data_ptr() != source.data_ptr()]
+    # a compiled graph loses writes to a float64 scalar (a normalizer's count): a scalar buffer is a vector of one here
+    scalar = [target.dim() == 0 and not source.requires_grad for target, source in apart]
+    return [(t.view(1), s.view(1)) if one else (t, s) for (t, s), one in zip(apart, scalar, strict=True)]
 
 
 def averaging(loss: nn.Module, tau: float) -> Callable[[], None] | None:

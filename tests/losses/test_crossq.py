@@ -1,0 +1,84 @@
+"""CrossQ's loss: the joint forward, agreement with TorchRL's, gradients, no target network."""
+
+from functools import partial
+
+import pytest
+import torch
+from torchrl.objectives import CrossQLoss as TorchRLCrossQLoss
+
+from pgkit import controllers, envs, losses, modules, updates
+from tests.losses.test_redq import assert_each_term_trains_its_own, constant_noise, gradients
+from tests.losses.test_sac import batch
+
+__all__ = ["constant_noise"]
+
+
+def test_agrees_with_torchrl():
+    torch.manual_seed(0)
+    env = envs.make("HalfCheetah-v5")
+    actor = modules.tanh_normal_actor(env, (16,)).double()
+    critics = [modules.q_value(env, 1, (16,)).double() for _ in range(2)]
+    data = batch(obs=17, actions=6).double()
+    data["next", "done"], data["next", "terminated"] = (data["next", k].bool() for k in ("done", "terminated"))
+    theirs = TorchRLCrossQLoss(actor, critics, loss_function="l2", target_entropy=-6.0, alpha_init=0.3)
+    theirs.make_value_estimator(gamma=0.97)
+    mine = losses.CrossQLoss(actor, critics, alpha_init=0.3, gamma=0.97)
+    outs = []
+    for loss in (mine, theirs):
+        copy = data.copy()
+        torch.manual_seed(7)
+        out = loss(copy)
+        outs.append((out, copy["td_error"], gradients(loss, out)))
+    (a, error, grads), (b, their_error, their_grads) = outs
+    for key in ("loss_actor", "loss_qvalue", "loss_alpha", "alpha", "entropy"):
+        torch.testing.assert_close(a[key], b[key])
+    torch.testing.assert_close(error, their_error)
+    for term in grads:
+        for x, y in zip(grads[term], their_grads[term], strict=True):
+            torch.testing.assert_close(x, y)
+
+
+@pytest.mark.usefixtures("constant_noise")
+def test_values_by_hand_of_a_joint_batch_norm():
+    # Q_i = batch norm of the observation: s = 0, 2 and s' = 4, 10 are normalized together: mean 4, variance
+    # (16 + 4 + 0 + 36) / 4 = 14. Apart they would be -1, 1 and -1, 1. y = 1 + 0.5 * (s' - 4) / √14
+    # the running statistics move once, by the share 0.01 from 0 and 1: mean 0.04, variance 1 + 0.01 * (14 - 1) = 1.13
+    # and the actor's loss reads those: -mean((s - 0.04) / √1.13) over s = 0, 2
+    env = envs.make("Pendulum-v1")
+    body = partial(modules.batch_renorm_mlp, hidden=(), norm=partial(modules.EnsembleBatchRenorm, eps=0.0))
+    critics = modules.q_value(env, 2, body=body).double()
+    norm, last = critics.module.layers
+    last.weight.data.zero_()
+    last.weight.data[:, 0, 0] = 1.0
+    actor = modules.tanh_normal_actor(env, (8,)).double()
+    loss = losses.CrossQLoss(actor, critics, temperature=controllers.FixedTemperature(0.0), gamma=0.5)
+    data = batch(2).double()
+    for key in ("done", "terminated"):
+        data["next", key] = torch.zeros(2, 1, dtype=torch.bool)
+    data["observation"][:, 0] = torch.tensor([0.0, 2.0])
+    data["next", "observation"][:, 0] = torch.tensor([4.0, 10.0])
+    data["next", "reward"].fill_(1.0)
+    for other in (1, 2):  # not constant, so that no variance is zero
+        data["observation"][:, other] = torch.tensor([1.0, 2.0])
+    out = loss(data)
+    q, target = [(0 - 4) / 14**0.5, (2 - 4) / 14**0.5], [1.0, 1 + 0.5 * 6 / 14**0.5]
+    squares = [(a - b) ** 2 for a, b in zip(q, target, strict=True)]
+    assert out["loss_qvalue"].item() == pytest.approx(2 * sum(squares) / 2)
+    assert out["loss_actor"].item() == pytest.approx(-(1 - 0.04) / 1.13**0.5)
+    assert norm.mean[:, 0, 0].tolist() == [pytest.approx(0.04)] * 2
+    assert norm.var[:, 0, 0].tolist() == [pytest.approx(1.13)] * 2
+    assert norm.steps.flatten().tolist() == [1, 1]
+
+
+def test_there_is_no_target_network():
+    env = envs.make("Pendulum-v1")
+    loss = losses.CrossQLoss(modules.tanh_normal_actor(env, (8,)), modules.q_value(env, 2, (8,)))
+    assert not [name for name, _ in loss.named_children() if name.startswith("target_")]
+    assert updates.targets.averaging(loss, 0.005) is None
+
+
+def test_gradients_reach_the_right_parameters():
+    env = envs.make("Pendulum-v1")
+    actor = modules.tanh_normal_actor(env, encoder=modules.Encoder(env, partial(modules.batch_renorm_mlp, hidden=(8,))))
+    loss = losses.CrossQLoss(actor, modules.q_value(env, 2, body=partial(modules.batch_renorm_mlp, hidden=(8,))))
+    assert_each_term_trains_its_own(loss, loss(batch()))
