@@ -9,10 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torchrl.data import LazyMemmapStorage, LazyTensorStorage
+from torchrl.modules import ProbabilisticActor
 
 from pgkit import collectors, controllers, data, envs, heads, losses, modules, run, updates
 
@@ -120,7 +121,7 @@ VARIANTS = {
 }
 
 
-def networks(args: Args, env: envs.VectorEnv) -> tuple[modules.Actor, modules.QValue, modules.ObsNormalizer | None]:
+def networks(args: Args, env: envs.VectorEnv) -> tuple[ProbabilisticActor, modules.QValue, Any]:
     """The actor, the critics, and what normalizes the observations of both."""
     bodies = {
         "simba": lambda sizes: partial(modules.simba, width=sizes[-1], blocks=len(sizes)),
@@ -130,21 +131,17 @@ def networks(args: Args, env: envs.VectorEnv) -> tuple[modules.Actor, modules.QV
     normalizer = modules.ObsNormalizer(env) if args.critic == "simba" else None
     encoder = modules.Encoder(env, body(args.hidden)) if body else None
     actor = modules.tanh_normal_actor(env, args.hidden, encoder=encoder, normalizer=normalizer)
-    critics = modules.q_value(
-        env,
-        args.num_critics,
-        hidden,
-        norm=modules.EnsembleLayerNorm if args.critic in ("layernorm", "droq") else None,
-        dropout=args.dropout if args.critic == "droq" else 0.0,
-        body=body(hidden) if body else None,
-        head={
-            "scalar": None,
-            "quantile": heads.Quantiles(args.atoms, args.drop_atoms),
-            "categorical": heads.Bins(*args.value_range, size=args.bins),
-        }[args.value_head],
-        normalizer=normalizer,
-    )
-    return actor, critics, normalizer
+    layers = {
+        "norm": modules.EnsembleLayerNorm if args.critic in ("layernorm", "droq") else None,
+        "dropout": args.dropout if args.critic == "droq" else 0.0,
+        "body": body(hidden) if body else None,
+    }
+    head = {
+        "scalar": None,
+        "quantile": heads.Quantiles(args.atoms, args.drop_atoms),
+        "categorical": heads.Bins(*args.value_range, size=args.bins),
+    }[args.value_head]
+    return actor, modules.q_value(env, args.num_critics, hidden, **layers, head=head, normalizer=normalizer), normalizer
 
 
 def main(args: Args) -> None:
@@ -160,13 +157,9 @@ def main(args: Args) -> None:
             target_entropy = -dimensions if args.target_entropy is None else args.target_entropy
             temperature = controllers.Temperature(target_entropy, args.alpha_init)
 
-        buffer = data.ReplayBuffer(
-            env,
-            args.buffer_size,
-            n_steps=args.n_step,
-            sampler=data.Prioritized() if args.replay == "prioritized" else None,
-            storage=partial(LazyMemmapStorage, scratch_dir=args.buffer_dir) if args.buffer_dir else LazyTensorStorage,
-        )
+        sampler = data.Prioritized() if args.replay == "prioritized" else None
+        storage = partial(LazyMemmapStorage, scratch_dir=args.buffer_dir) if args.buffer_dir else LazyTensorStorage
+        buffer = data.ReplayBuffer(env, args.buffer_size, n_steps=args.n_step, sampler=sampler, storage=storage)
         groups = [
             {"params": list(actor.parameters()), "lr": args.learning_rate},
             {"params": list(critics.parameters()), "lr": args.q_learning_rate},

@@ -162,6 +162,21 @@ def test_ls_shows_first_lines_and_runs_nothing(shelf: Path, capsys: pytest.Captu
     ]
 
 
+def test_variants_are_listed_with_their_settings_run_and_copied(shelf: Path, inside: Path, capsys, monkeypatch):
+    recipe = (
+        '"""Say."""\nVARIANTS = {"loud": dict(num_times=2, tone="a")}\nimport sys\nraise SystemExit((*sys.argv,))\n'
+    )
+    (shelf / "shelf/say.py").write_text(recipe)
+    main(["ls"])
+    assert "loud         say --num-times 2 --tone a" in capsys.readouterr().out.splitlines()
+    with pytest.raises(SystemExit) as exit_:
+        main(["run", "loud", "--seed", "3"])
+    assert exit_.value.code == ("loud", "--variant", "loud", "--seed", "3")
+    main(["cp", "loud", str(shelf / "mine.py")])
+    assert capsys.readouterr().out.endswith("mine.py --variant loud\n")
+    assert "nearest: loud" in fail(capsys, "run", "loudd")
+
+
 def test_cp_copies_and_never_overwrites(shelf: Path, capsys: pytest.CaptureFixture[str]):
     target = shelf / "mine.py"
     main(["cp", "ppo", str(target)])

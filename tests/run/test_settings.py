@@ -16,6 +16,12 @@ class Args(RunArgs):
     """Widths."""
 
 
+@dataclass
+class Variant(Args):
+    variant: str = ""
+    """Settings to start from."""
+
+
 PRESETS = {
     "dm_control/cheetah*": {"learning_rate": 0.1},
     "dm_control/*": {"learning_rate": 0.2, "num_envs": 3},
@@ -27,6 +33,19 @@ def test_flags_beat_the_preset_which_beats_the_default(capsys: pytest.CaptureFix
     args = parse(Args, PRESETS, ["--env-id", "dm_control/hopper-hop-v0", "--learning-rate", "0.5"])
     assert (args.learning_rate, args.num_envs, args.hidden) == (0.5, 3, (64, 64))
     assert capsys.readouterr().out == "preset dm_control/*: num_envs=3\n"
+
+
+def test_flags_beat_the_preset_which_beats_the_variant(capsys: pytest.CaptureFixture[str]):
+    variants = {"fast": {"learning_rate": 0.9, "num_envs": 16, "seed": 7}}
+    args = parse(
+        Variant, PRESETS, ["--variant", "fast", "--env-id", "dm_control/hopper-hop-v0", "--seed", "8"], variants
+    )
+    assert (args.learning_rate, args.num_envs, args.seed, args.variant) == (0.2, 3, 8, "fast")
+    assert capsys.readouterr().out == "preset dm_control/*: learning_rate=0.2 num_envs=3\n"
+    assert parse(Variant, PRESETS, ["--variant=fast"], variants).learning_rate == 0.9
+    assert capsys.readouterr().out.startswith("variant fast: learning_rate=0.9 num_envs=16 seed=7\n")
+    with pytest.raises(UserError, match="--variant slow: this recipe has fast"):
+        parse(Variant, PRESETS, ["--variant", "slow"], variants)
 
 
 def test_the_first_pattern_that_fits_is_the_only_one_used():
