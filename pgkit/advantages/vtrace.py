@@ -18,7 +18,8 @@ class VTrace(Advantage):
     """Advantages and value targets of the present policy from a rollout of an older one.
 
     Espeholt et al., 2018 (https://arxiv.org/abs/1802.01561). The advantage carries the clipped importance weight:
-    :class:`~pgkit.losses.A2CLoss` on it is IMPALA. Besides what every estimator writes, the present policy's
+    :class:`~pgkit.losses.A2CLoss` on it is IMPALA. The rollout's own actions are scored (TorchRL's ``VTrace`` scores
+    actions drawn anew). Besides what every estimator writes, the present policy's
     log-probability of each action goes to ``log_prob_key``: a PPO loss that reads it as its ``sample_log_prob`` clips
     around the present policy (Hilton et al., 2022, https://arxiv.org/abs/2110.00641).
 

@@ -54,9 +54,9 @@ def vtrace(
     cut = cuts(next_value, reward, done, terminated)
     ratio, alive = log_ratio.exp(), ~terminated
     rho, c = ratio.clamp(max=rho_thresh), lmbda * ratio.clamp(max=c_thresh)
-    delta = rho * (reward + gamma * alive * next_value - value)
+    delta = rho * (reward + gamma * next_value * alive - value)
     excess = discounted_sum(delta, gamma * c * ~done)
     target = value + excess
     following = torch.cat([target[..., 1:, :], next_value[..., -1:, :]], -2)
     bootstrap = torch.where(cut, next_value, lmbda * following + (1 - lmbda) * next_value)
-    return rho * (reward + gamma * alive * bootstrap - value), target
+    return rho * (reward + gamma * bootstrap * alive - value), target
