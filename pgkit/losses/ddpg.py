@@ -60,9 +60,8 @@ class DDPGLoss(QLoss):
         if critics != 1:
             raise UserError(f"DDPGLoss has one critic, these are {critics}: num_critics=1, or losses.TD3Loss for two")
         super().__init__(
-            actor_network, value_network if hasattr(value_network, "num_critics") else [value_network], gamma=gamma,
-            delay_actor=delay_actor, delay_qvalue=delay_value, separate_losses=separate_losses, reduction=reduction,
-            head=head,
+            actor_network, value_network, num_qvalue_nets=1, gamma=gamma, delay_actor=delay_actor,
+            delay_qvalue=delay_value, separate_losses=separate_losses, reduction=reduction, head=head,
         )  # fmt: skip
         if isinstance(self.head, Scalar):
             self.head = Scalar(loss_function)

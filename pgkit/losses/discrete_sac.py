@@ -102,7 +102,8 @@ class DiscreteSACLoss(SoftQLoss):
         if self._each is not None:
             return self._each(data, params).get(key).movedim(0, -2)
         with params.to_module(self.qvalue_network, preserve_module_state=False):
-            return self.qvalue_network(data).get(key)
+            q = self.qvalue_network(data).get(key)
+        return q if q.dim() > data.dim() + 1 else q.unsqueeze(-2)
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -31,7 +31,8 @@ class QLoss(Loss):
         actor_network: probabilistic actor, or a deterministic one.
         qvalue_network: an ensemble, ``state_action_value [*B, critics]`` (with a head ``[*B, critics, size]``) and an
             attribute ``num_critics`` (:func:`pgkit.modules.q_value`); or a list of modules with ``[*B, 1]``; or one
-            such module, which is copied ``num_qvalue_nets`` times with weights drawn again, as in TorchRL.
+            such module, which is copied ``num_qvalue_nets`` times with weights drawn again, as in TorchRL. A list of
+            one, or one with ``num_qvalue_nets=1``, is used as it is.
         num_qvalue_nets: how many critics; an ensemble or a list brings its own number.
         gamma: discount. This loss is its only owner.
         delay_actor: use a delayed actor in the target.
@@ -79,18 +80,20 @@ class QLoss(Loss):
         self.register_coeff_buffer("gamma", gamma)
         self.convert_to_functional(actor_network, "actor_network", create_target_params=delay_actor)
         several = isinstance(qvalue_network, Sequence) and not isinstance(qvalue_network, torch.nn.Module)
-        ensemble = not several and hasattr(qvalue_network, "num_critics")
-        self.num_critics = len(qvalue_network) if several else getattr(qvalue_network, "num_critics", num_qvalue_nets)
-        own = getattr(qvalue_network[0] if several else qvalue_network, "head", None)
+        networks = list(qvalue_network) if several else [qvalue_network]
+        alone = len(networks) == 1 and (several or num_qvalue_nets == 1 or hasattr(networks[0], "num_critics"))
+        number = len(networks) if several else num_qvalue_nets
+        self.num_critics = getattr(networks[0], "num_critics", 1) if alone else number
+        own = getattr(networks[0], "head", None)
         self.head = head or (own if isinstance(own, Head) else Scalar())
         self.convert_to_functional(
-            list(qvalue_network) if several else qvalue_network,
+            networks if len(networks) > 1 else networks[0],
             "qvalue_network",
-            None if ensemble else self.num_critics,
+            None if alone else number,
             create_target_params=delay_qvalue,
             compare_against=list(actor_network.parameters()) if separate_losses else None,
         )
-        self._each = None if ensemble else _vmap_func(self.qvalue_network, (None, 0), randomness=self.vmap_randomness)
+        self._each = None if alone else _vmap_func(self.qvalue_network, (None, 0), randomness=self.vmap_randomness)
         if hasattr(actor_network, "dist_sample_keys"):
             self.set_keys(action=actor_network.dist_sample_keys[0], log_prob=actor_network.log_prob_keys[0])
 

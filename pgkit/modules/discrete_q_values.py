@@ -28,7 +28,7 @@ def discrete_q_value(
     """Values of every action: ``observation [*B, obs] -> action_value [*B, num_critics, actions]``.
 
     All critics are evaluated by one batched matrix product a layer. TorchRL's losses stack their critics themselves:
-    give those a list of modules with ``num_critics=1``.
+    give those a list of single ones, ``[*B, actions]`` each.
 
     Args:
         env: an environment with one discrete action; sizes come from its specs.

@@ -145,11 +145,7 @@ def test_straight_through_samples_are_one_hot_forward_and_relaxed_backward():
 def test_agrees_with_torchrl(one_hot, distance):
     env = GymEnv("CartPole-v1", categorical_action_encoding=not one_hot)
     actor = modules.categorical_actor(env, (16,)).double()
-    critics = [modules.discrete_q_value(env, 1, (16,)).double() for _ in range(2)]
-    singles = [
-        TensorDictModule(nn.Sequential(critic.module, nn.Flatten(-2)), ["observation"], ["action_value"])
-        for critic in critics
-    ]  # [*B, 1, actions] -> [*B, actions]
+    singles = [TensorDictModule(modules.mlp(4, 2, (16,)), ["observation"], ["action_value"]).double() for _ in range(2)]
     settings = {"loss_function": distance, "alpha_init": 0.3, "num_actions": 2, "target_entropy_weight": 0.7}
     space = "one-hot" if one_hot else "categorical"
     theirs = TorchRLDiscreteSACLoss(actor, singles, action_space=space, **settings)
@@ -227,6 +223,17 @@ def test_trains_on_replayed_actions_eager_as_compiled(form, one_hot):
     (a, eager), (b, compiled) = results
     torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-4)
     assert eager == pytest.approx(compiled, rel=1e-2, abs=1e-2)
+
+
+def test_a_list_of_one_critic_is_that_critic():
+    env = envs.make("CartPole-v1")
+    actor = modules.categorical_actor(env, (8,))
+    single = TensorDictModule(modules.mlp(4, 2, (8,)), ["observation"], ["action_value"])
+    loss = losses.DiscreteSACLoss(actor, [single])
+    SoftUpdate(loss, tau=0.1)
+    data = batch(dtype=torch.float32)
+    q = single(data.copy())["action_value"].gather(-1, data["action"].unsqueeze(-1))
+    assert loss(data)["q_value"].item() == pytest.approx(q.mean().item()) and loss.num_critics == 1
 
 
 def test_refusals():
