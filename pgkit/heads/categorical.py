@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from pgkit.errors import UserError
 from pgkit.functional import categorical_mean, categorical_projection, cross_entropy, hl_gauss
 
 
@@ -87,4 +88,4 @@ def _support(head: Bins | Categorical, out: Tensor) -> Tensor:
 
 def _check(low: float, high: float, size: int) -> None:
     if not (low < high and size > 1):
-        raise ValueError(f"{size} bins from {low} to {high}: give at least 2, from a lower to a higher return")
+        raise UserError(f"{size} bins from {low} to {high}: give at least 2, from a lower to a higher return")

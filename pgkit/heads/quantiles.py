@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from pgkit.errors import UserError
 from pgkit.functional import quantile_huber
 
 
@@ -29,7 +30,7 @@ class Quantiles:
 
     def __post_init__(self) -> None:
         if not 0 <= self.drop < self.size:
-            raise ValueError(f"drop={self.drop} of {self.size} quantiles: it must leave at least one")
+            raise UserError(f"drop={self.drop} of {self.size} quantiles: it must leave at least one")
 
     def mean(self, out: Tensor) -> Tensor:
         """``[*B, critics, size] -> [*B, critics]``."""

@@ -38,7 +38,7 @@ class SoftQLoss(QLoss):
 
     Raises:
         UserError: the actor is discrete and the loss is not, or the other way round (``takes_discrete``); ``subset`` is
-            above the number of critics.
+            above the number of critics; ``loss_function`` is given for critics whose head has its own.
     """
 
     takes_discrete: ClassVar[bool] = False
@@ -73,11 +73,16 @@ class SoftQLoss(QLoss):
             actor_network, qvalue_network, num_qvalue_nets=num_qvalue_nets, gamma=gamma, delay_actor=delay_actor,
             delay_qvalue=delay_qvalue, separate_losses=separate_losses, reduction=reduction, head=head,
         )  # fmt: skip
-        if isinstance(self.head, Scalar):
+        if self.head == Scalar():
             self.head = Scalar(loss_function)
+        elif loss_function != "l2":
+            raise UserError(f"loss_function={loss_function!r} is for critics without a head, these have {self.head}")
         if subset is not None and not 1 <= subset <= self.num_critics:
             raise UserError(f"subset={subset} of {self.num_critics} critics: give a number from 1 to the latter")
-        self.subset, self.actor_value = subset, {"min": twin_minimum, "mean": ensemble_mean}[actor_value]
+        values = {"min": twin_minimum, "mean": ensemble_mean}
+        if actor_value not in values:
+            raise UserError(f"actor_value={actor_value!r}: give 'min' or 'mean'")
+        self.subset, self.actor_value = subset, values[actor_value]
         self.temperature: Any = temperature
         if temperature is None:
             log_alpha = torch.tensor(log(alpha_init))

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from pgkit import functional, heads
+from pgkit.errors import UserError
 
 HEADS = [
     heads.Scalar(),
@@ -74,5 +75,5 @@ def test_bins_take_the_least_of_the_means():
     "make", [partial(heads.Quantiles, 3, drop=3), partial(heads.Bins, 1, 1), partial(heads.Categorical, 0, 1, 1)]
 )
 def test_settings_that_mean_nothing_are_refused(make):
-    with pytest.raises(ValueError):
+    with pytest.raises(UserError):
         make()

@@ -146,10 +146,15 @@ def test_an_ensemble_of_one_s_own_without_members_and_a_list_take_a_subset_too()
     torch.testing.assert_close(some, whole[:, index])
 
 
-def test_a_subset_above_the_number_of_critics_is_refused():
+def test_settings_that_do_not_fit_the_critics_are_refused():
     env = envs.make("Pendulum-v1")
     with pytest.raises(UserError, match="subset=3 of 2 critics"):
         losses.SACLoss(modules.tanh_normal_actor(env), modules.q_value(env, 2), subset=3)
+    with pytest.raises(UserError, match="actor_value='max': give 'min' or 'mean'"):
+        losses.SACLoss(modules.tanh_normal_actor(env), modules.q_value(env, 2), actor_value="max")
+    critics = modules.q_value(env, 2, head=heads.Quantiles(5))
+    with pytest.raises(UserError, match="loss_function='l1' is for critics without a head"):
+        losses.SACLoss(modules.tanh_normal_actor(env), critics, loss_function="l1")
 
 
 @pytest.mark.parametrize("head", [heads.Quantiles(7), heads.Bins(-5, 5, 21), heads.Categorical(-5, 5, 21)], ids=str)
