@@ -161,7 +161,7 @@ class ReplayBuffer:
     def write_back(self, data: TensorDictBase, index: Tensor, batch: TensorDictBase) -> None:
         """Makes the ``td_error`` of a batch the priorities of its rows, where the draws are prioritized."""
         if self.sampler is not None:
-            self.sampler.write_back(index, batch["td_error"])
+            self.sampler.write_back(index, batch["td_error"].flatten())
 
     def gather(self, gamma: float | Tensor) -> Gather:
         """``(data, index) -> batch`` of :attr:`data`, a function of tensors that can be compiled."""

@@ -99,7 +99,7 @@ class TorchRLBatches:
 
     def write_back(self, data: TensorDictBase, index: Tensor, batch: TensorDictBase) -> None:
         if self.prioritized:
-            data[self.priority].copy_(batch[self.priority])
+            data[self.priority].copy_(batch[self.priority].flatten())
 
     def drawn(self) -> None:
         if self.prioritized:

@@ -87,3 +87,8 @@ def show(key: Any) -> str:
 def shape(x: Tensor) -> str:
     """A shape as ``(64, 1)``."""
     return str(tuple(x.shape))
+
+
+def is_loss(key: Any) -> bool:
+    """Whether an entry of a loss's result is minimized: ``loss_...``, or TorchRL's ``loss`` where it has but one."""
+    return isinstance(key, str) and (key == "loss" or key.startswith("loss_"))

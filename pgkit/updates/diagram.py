@@ -8,7 +8,7 @@ from typing import Any
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
-from pgkit.updates.chain import Chain, shape, show
+from pgkit.updates.chain import Chain, is_loss, shape, show
 from pgkit.updates.optimizers import parameters
 
 
@@ -23,7 +23,7 @@ def diagram(update: Any, chain: Chain, step: str, batch: TensorDictBase | None =
     """
     loss, optimizer = update.loss, update.optimizer
     rates = ", ".join(dict.fromkeys(f"{float(group['lr']):g}" for group in optimizer.param_groups))
-    minimized = [key for key in getattr(loss, "out_keys", None) or [] if show(key).startswith("loss_")]
+    minimized = [key for key in getattr(loss, "out_keys", None) or [] if is_loss(key)]
     head = {
         "data": chain.source,
         "advantage": chain.advantage and _described(chain.advantage),

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from pgkit.updates import optimizers
+from pgkit.updates.chain import is_loss
 from pgkit.updates.recorded import Step, recorded
 
 
@@ -80,7 +81,7 @@ class GradientStep:
             batch = gather(data, index)
             batch = batch if before is None else before(batch)
             out = loss(batch)
-            terms = [key for key in out.keys() if key.startswith("loss_") and (only is None or key in only)]
+            terms = [key for key in out.keys() if is_loss(key) and (only is None or key in only)]
             total = torch.stack([out[key].sum() for key in terms]).sum()
             grads = list(torch.autograd.grad(total, params, allow_unused=True, materialize_grads=True))
             with torch.no_grad():

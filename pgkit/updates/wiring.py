@@ -13,7 +13,7 @@ from torch.optim import Optimizer
 
 from pgkit.errors import UserError
 from pgkit.updates import entries, owners
-from pgkit.updates.chain import Chain
+from pgkit.updates.chain import Chain, is_loss
 
 
 def read_keys(loss: nn.Module, data: TensorDictBase) -> list[Any]:
@@ -28,7 +28,7 @@ def read_keys(loss: nn.Module, data: TensorDictBase) -> list[Any]:
         keys += [key for key in configured if isinstance(key, str | tuple)]
         if getattr(loss.tensor_keys, "advantage", None) in present:
             keys = [key for key in keys if not (isinstance(key, tuple) and key[0] == "next")]
-    keys += [key for key in (("collector", "mask"),) if key in present]
+    keys += [("collector", "mask"), *getattr(getattr(loss, "actor_network", None), "dist_params_keys", ())]
     return [key for key in dict.fromkeys(keys) if key in present]
 
 
@@ -62,7 +62,7 @@ def check(
         reason = entries.wrong_action(chain, batch)
     if reason:
         raise UserError(reason)
-    total = torch.stack([out[key].sum() for key in out.keys() if key.startswith("loss_")]).sum()
+    total = torch.stack([out[key].sum() for key in out.keys() if is_loss(key)]).sum()
     owners.check_parameters(chain, optimizer, total)
     for x, before in buffers:  # statistics that a forward pass updates
         x.copy_(before)
@@ -82,7 +82,7 @@ def _run(chain: Chain, batch: TensorDictBase) -> TensorDictBase:
 
 
 def _check_result(chain: Chain, batch: TensorDictBase, out: TensorDictBase) -> None:
-    losses = [key for key in out.keys() if key.startswith("loss_")]
+    losses = [key for key in out.keys() if is_loss(key)]
     if not losses:
         raise UserError(
             f"{chain.name} returned no entry that begins with 'loss_' (only {', '.join(out.keys())}): the sum of "

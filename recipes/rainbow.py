@@ -1,0 +1,153 @@
+"""Rainbow: categorical values, dueling noisy network, double target, n-step returns, prioritized replay.
+
+The loss is TorchRL's DistributionalDQNLoss as it is; replay, collector and update are pgkit's. Tuned values for
+CartPole are in ``PRESETS`` below.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import torch
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+from torchrl.modules import DistributionalQValueActor, NoisyLinear
+from torchrl.objectives import DistributionalDQNLoss
+
+from pgkit import collectors, controllers, data, envs, run, updates
+from pgkit.errors import UserError
+
+
+@dataclass
+class Args(run.RunArgs):
+    """Settings of Rainbow."""
+
+    env_id: str = "CartPole-v1"
+    """Gymnasium id with one discrete action."""
+    num_envs: int = 4
+    """Envs stepped side by side."""
+    steps: int = 1
+    """Steps each env takes between updates; the network's noise is drawn anew for each rollout."""
+    random_frames: int = 1_000
+    """Frames with random actions at the start; updates begin after them."""
+    batch_size: int = 64
+    """Rows of a batch."""
+    updates_per_step: float = 0.25
+    """Gradient steps for each frame."""
+    learning_rate: float = 5e-4
+    """Adam's step size."""
+    max_grad_norm: float | None = 10.0
+    """Bound of the gradient's norm; None is none."""
+    gamma: float = 0.99
+    """Discount."""
+    tau: float = 0.005
+    """Share of the network that its target takes over at each gradient step."""
+    atoms: int = 51
+    """Values that the distribution of the return is spread over."""
+    v_min: float = -10.0
+    """The least of them."""
+    v_max: float = 100.0
+    """The largest of them: above any discounted return that is possible."""
+    noise: float = 0.5
+    """Initial standard deviation of the noisy weights."""
+    n_step: int = 3
+    """Length of the returns that the network learns."""
+    alpha: float = 0.5
+    """How much priorities count in the draws; 0 draws uniformly."""
+    beta: float = 0.4
+    """How far importance weights correct for that at the start; it rises to 1."""
+    buffer_size: int = 100_000
+    """Frames that the replay buffer keeps."""
+    save_buffer: bool = False
+    """Save the replay buffer beside each checkpoint, so that a resumed run goes on bit for bit."""
+    hidden: tuple[int, ...] = (128, 128)
+    """Sizes of the hidden layers; the last is a noisy one in each stream."""
+    log_every: int = 1_000
+    """A row of metrics every so many frames."""
+
+
+PRESETS = {"CartPole-*": dict(total_frames=100_000, eval_every=10_000)}
+
+
+class DuelingNoisyNet(nn.Module):
+    """Log-probabilities of the return's atoms, by a value and an advantage stream: ``[*B, atoms, actions]``."""
+
+    def __init__(self, features: int, actions: int, atoms: int, hidden: Sequence[int], noise: float) -> None:
+        super().__init__()
+        layers: list[nn.Module] = []
+        for size in hidden[:-1]:
+            layers += [nn.Linear(features, size), nn.ReLU()]
+            features = size
+        self.body, self.sizes = nn.Sequential(*layers), (atoms, actions)
+
+        def stream(outputs: int) -> nn.Sequential:
+            noisy = partial(NoisyLinear, std_init=noise, use_exploration_type=False)  # noise in training mode only
+            return nn.Sequential(noisy(features, hidden[-1]), nn.ReLU(), noisy(hidden[-1], outputs))
+
+        self.value, self.advantage = stream(atoms), stream(atoms * actions)
+
+    def forward(self, observation: Tensor) -> Tensor:
+        x = self.body(observation)
+        advantage = self.advantage(x).unflatten(-1, self.sizes)
+        return (self.value(x).unsqueeze(-1) + advantage - advantage.mean(-1, keepdim=True)).log_softmax(-2)
+
+    def draw_noise(self) -> None:
+        """Draws the noise of all weights anew; in evaluation mode there is none."""
+        for module in self.modules():
+            if isinstance(module, NoisyLinear):
+                module.reset_noise()
+
+
+def main(args: Args) -> None:
+    """Trains, logs, evaluates, saves."""
+    with run.Run(args, recipe="rainbow") as log:
+        make_env = partial(envs.make, args.env_id)
+        env = make_env(num_envs=args.num_envs, seed=args.seed, workers=args.workers)
+        if not hasattr(env.action_spec_unbatched.space, "n"):
+            raise UserError(f"rainbow needs one discrete action, '{args.env_id}' has another action space: use sac")
+        sizes = (env.observation_spec_unbatched["observation"].shape[-1], env.action_spec_unbatched.space.n)
+        net = DuelingNoisyNet(*sizes, args.atoms, args.hidden, args.noise)
+        actor = DistributionalQValueActor(
+            TensorDictModule(net, in_keys=["observation"], out_keys=["action_value"]),
+            support=torch.linspace(args.v_min, args.v_max, args.atoms),
+            action_space="categorical",
+        )
+        sampler = data.Prioritized(args.alpha, args.beta)
+        buffer = data.ReplayBuffer(env, args.buffer_size, n_steps=args.n_step, sampler=sampler)
+        update = updates.OffPolicyUpdate(
+            loss=DistributionalDQNLoss(actor, gamma=args.gamma, delay_value=True),
+            buffer=buffer,
+            optimizer=torch.optim.Adam(actor.parameters(), lr=args.learning_rate, eps=1e-4),
+            batch_size=args.batch_size,
+            updates_per_step=args.updates_per_step,
+            tau=args.tau,
+            learning_starts=max(args.random_frames, args.batch_size),
+            max_grad_norm=args.max_grad_norm,
+            total_frames=args.total_frames,
+            compile=args.compile,
+        )
+        collector = collectors.VectorCollector(
+            env,
+            actor,
+            frames_per_batch=args.num_envs * args.steps,
+            total_frames=args.total_frames,
+            init_random_frames=args.random_frames,
+            compile=args.compile,
+        )
+
+        replay = data.BesideCheckpoint(buffer, log.dir / "checkpoints" / "buffer.pt", save=args.save_buffer)
+        log.track(policy=actor, eval_env=make_env, update=update, collector=collector, replay=replay)
+        beta = controllers.linear(args.beta, 1.0)
+        for rollout in collector:
+            net.draw_noise()
+            sampler.set_beta(beta(collector.frames / args.total_frames))
+            metrics = update(rollout)
+            compile_seconds = update.compile_seconds + collector.compile_seconds
+            log.step(collector.frames, rollout, metrics, compile_seconds=compile_seconds, every=args.log_every)
+        collector.shutdown()
+
+
+if __name__ == "__main__":
+    run.launch(main, Args, PRESETS)
