@@ -17,7 +17,7 @@ HEADS = [
 ]
 
 
-@pytest.mark.parametrize("head", HEADS, ids=str)
+@pytest.mark.parametrize("head", HEADS, ids=lambda head: type(head).__name__)
 def test_the_seam(head):
     assert isinstance(head, heads.Head)
     out = torch.randn(4, 5, 3, head.size, dtype=torch.float64)
@@ -28,7 +28,7 @@ def test_the_seam(head):
     assert head.loss(out, atoms, weights).shape == (4, 5, 3)
 
 
-@pytest.mark.parametrize("head", HEADS, ids=str)
+@pytest.mark.parametrize("head", HEADS, ids=lambda head: type(head).__name__)
 def test_it_learns_the_target_s_mean(head):
     out = torch.zeros(1, 2, head.size, dtype=torch.float64, requires_grad=True)
     atoms = torch.tensor([[1.0, 2.0]], dtype=torch.float64)

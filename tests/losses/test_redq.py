@@ -114,7 +114,8 @@ def test_the_target_is_the_least_of_the_drawn_critics_and_the_actor_s_value_the_
     loss = losses.REDQLoss(actor, critics, sub_sample_len=2, temperature=controllers.FixedTemperature(0.0), gamma=0.5)
     SoftUpdate(loss, tau=0.1)
     data = batch(1)
-    data["next", "reward"].fill_(1.0), data["next", "terminated"].fill_(False)
+    data["next", "reward"].fill_(1.0)
+    data["next", "terminated"].fill_(False)
     seen = set()
     for _ in range(60):
         out = loss(data)
@@ -157,7 +158,9 @@ def test_settings_that_do_not_fit_the_critics_are_refused():
         losses.SACLoss(modules.tanh_normal_actor(env), critics, loss_function="l1")
 
 
-@pytest.mark.parametrize("head", [heads.Quantiles(7), heads.Bins(-5, 5, 21), heads.Categorical(-5, 5, 21)], ids=str)
+@pytest.mark.parametrize(
+    "head", [heads.Quantiles(7), heads.Bins(-5, 5, 21), heads.Categorical(-5, 5, 21)], ids=lambda x: type(x).__name__
+)
 @pytest.mark.parametrize("make", [losses.SACLoss, losses.REDQLoss, losses.CrossQLoss])
 def test_every_loss_takes_every_head(make, head):
     env = envs.make("Pendulum-v1")
