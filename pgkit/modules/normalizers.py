@@ -69,6 +69,17 @@ class ReturnScale(RunningMoments):
         """Standard deviation of the returns, a scalar; 1 before the first update."""
         return (self.var + 1e-8).sqrt()
 
-    def update(self, x: Tensor) -> None:
-        """Takes in the ``value_target`` that GAE wrote with this scale, any shape."""
-        super().update(x * self.scale)
+    @torch.no_grad()
+    def update(self, x: Tensor, critic: nn.Module | None = None) -> None:
+        """Takes in the ``value_target`` that GAE wrote with this scale, any shape.
+
+        With ``critic``, its last linear layer is rescaled so that its values in the rewards' unit stay (van Hasselt et
+        al., 2016, https://arxiv.org/abs/1602.07714). Short rollouts need it: their targets are mostly the critic's own
+        values, so a scale that changes them feeds itself.
+        """
+        before = self.scale
+        super().update(x * before)
+        if critic is not None:
+            head = [module for module in critic.modules() if isinstance(module, nn.Linear)][-1]
+            for parameter in head.parameters():
+                parameter.mul_(before / self.scale)
