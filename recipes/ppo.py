@@ -60,6 +60,12 @@ class Args(run.RunArgs):
     """Sizes of the hidden layers, of actor and critic alike."""
     log_std: float = -0.5
     """Initial log standard deviation of a continuous policy."""
+    recurrent: Literal["none", "gru", "lstm"] = "none"
+    """Give actor and critic one memory, which begins anew with every episode."""
+    memory_size: int = 64
+    """Size of the memory."""
+    sequence_length: int = 16
+    """With a memory: steps of a sequence, which gradients flow through; minibatches are made of whole ones."""
     collector: Literal["pgkit", "torchrl"] = "pgkit"
     """pgkit's VectorCollector, or torchrl.collectors.Collector."""
 
@@ -73,6 +79,10 @@ PRESETS = {
     "Pendulum-*": dict(
         total_frames=200_000, eval_every=50_000, steps=128, minibatch_size=128, learning_rate=1e-3, anneal=True,
         gamma=0.95, log_std=0.5, normalize_advantage="minibatch",
+    ),
+    "pgkit/TMaze-*": dict(
+        total_frames=50_000, eval_every=10_000, steps=128, minibatch_size=256, learning_rate=1e-3, anneal=True,
+        entropy_coeff=0.01, normalize_advantage="off", normalize_obs=False, scale_returns=False, critic_coeff=0.5,
     ),
     "HalfCheetah-*": dict(lmbda=0.9),
     "Hopper-*": dict(learning_rate=2e-4, anneal=True),
@@ -88,11 +98,16 @@ def main(args: Args) -> None:
         normalizer = modules.ObsNormalizer(env) if args.normalize_obs else None
         scale = modules.ReturnScale() if args.scale_returns else None
 
+        parts = {"hidden": args.hidden, "normalizer": normalizer}
+        if args.recurrent != "none":
+            core = modules.gru if args.recurrent == "gru" else modules.lstm
+            parts = {"encoder": core(env, args.memory_size, **parts)}
+
         if env.action_spec.dtype.is_floating_point:
-            actor = modules.gaussian_actor(env, args.hidden, log_std=args.log_std, normalizer=normalizer)
+            actor = modules.gaussian_actor(env, log_std=args.log_std, **parts)
         else:
-            actor = modules.categorical_actor(env, args.hidden, normalizer=normalizer)
-        critic = modules.state_value(env, args.hidden, normalizer=normalizer)
+            actor = modules.categorical_actor(env, **parts)
+        critic = modules.state_value(env, **parts)
 
         loss = losses.ClipPPOLoss(
             actor,
@@ -109,13 +124,14 @@ def main(args: Args) -> None:
             average_gae=args.normalize_advantage == "rollout",
             return_scale=scale,
         )
-        parameters = [*actor.parameters(), *critic.parameters()]
+        parameters = list(dict.fromkeys([*actor.parameters(), *critic.parameters()]))  # a memory is in both
         update = updates.OnPolicyUpdate(
             loss=loss,
             advantage=advantage,
             optimizer=torch.optim.Adam(parameters, lr=args.learning_rate, eps=1e-5),
             epochs=args.epochs,
             minibatch_size=args.minibatch_size,
+            sequence_length=args.sequence_length if args.recurrent != "none" else None,
             max_grad_norm=args.max_grad_norm,
             recompute_advantage=args.recompute_advantage,
             target_kl=args.target_kl,

@@ -7,14 +7,18 @@ from typing import Any
 
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torchrl.envs import Compose, EnvBase, RewardSum, StepCounter, TransformedEnv
+from torchrl.data import Unbounded
+from torchrl.envs import Compose, EnvBase, InitTracker, RewardSum, StepCounter, TensorDictPrimer, TransformedEnv
+
+from pgkit.collectors.policy import memory
 
 
 class TorchRLCollector:
     """``torchrl.collectors.Collector`` as an iterable of rollouts that counts its frames.
 
     For any TorchRL environment, transformed or not. It adds ``RewardSum`` and ``StepCounter``, which write the
-    ``("next", "episode_reward")`` and ``("next", "step_count")`` that finished episodes are read from.
+    ``("next", "episode_reward")`` and ``("next", "step_count")`` that finished episodes are read from; for a recurrent
+    actor of pgkit's, also ``InitTracker`` and a primer of its ``recurrent_state``.
 
     Args:
         env: any TorchRL environment, pgkit's included.
@@ -35,7 +39,11 @@ class TorchRLCollector:
     ) -> None:
         from torchrl.collectors import Collector  # slow to import, and rarely needed
 
-        env = TransformedEnv(env, Compose(RewardSum(), StepCounter()))
+        transforms = [RewardSum(), StepCounter()]
+        if state := memory(actor, env.batch_size.numel()):
+            size = state["recurrent_state"].shape[-1]
+            transforms += [InitTracker(), TensorDictPrimer(recurrent_state=Unbounded((size,)), expand_specs=True)]
+        env = TransformedEnv(env, Compose(*transforms))
         self.frames, self.compile_seconds = 0, 0.0
         kwargs = {"trust_policy": True, "auto_register_policy_transforms": True} | kwargs
         self.collector = Collector(env, actor, frames_per_batch=frames_per_batch, total_frames=total_frames, **kwargs)

@@ -9,6 +9,8 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from pgkit.errors import UserError
+
 _ARRAYS = (spaces.Box, spaces.MultiBinary)  # whose observations are arrays
 
 
@@ -131,6 +133,8 @@ def observation_shape(space: gym.Space) -> tuple[int, ...]:
     """Shape of the float32 array an observation of ``space`` becomes: a Box keeps its own, all else is flattened."""
     if isinstance(space, spaces.Box):
         return space.shape or (1,)
+    if not space.is_np_flattenable:
+        raise UserError(f"the observation space {space} cannot become one vector: encode it in a wrapper")
     return (spaces.flatdim(space),)
 
 
@@ -164,4 +168,6 @@ def _action_converter(space: gym.Space) -> Callable[[np.ndarray], np.ndarray]:
     if isinstance(space, spaces.Discrete | spaces.MultiDiscrete):
         start = space.start
         return (lambda actions: actions + start) if np.any(start) else np.array
-    raise TypeError(f"action space {space} is not supported: Box, Discrete and MultiDiscrete are")
+    if isinstance(space, spaces.MultiBinary):
+        return lambda actions: actions.astype(space.dtype)
+    raise UserError(f"action space {space} is not supported: Box, Discrete, MultiDiscrete and MultiBinary are")

@@ -17,6 +17,7 @@ from torchrl.envs import EnvBase
 
 from pgkit.envs.arrays import ArrayEnv, observation_shape
 from pgkit.envs.layout import Layout, layout
+from pgkit.errors import UserError
 
 
 class VectorEnv(EnvBase):
@@ -116,4 +117,6 @@ def action_spec(space: gym.Space, num_envs: int) -> TensorSpec:
         return Categorical(int(space.n), shape=(num_envs,))
     if isinstance(space, spaces.MultiDiscrete):
         return MultiCategorical(space.nvec.tolist(), shape=(num_envs, len(space.nvec)))
-    raise TypeError(f"action space {space} is not supported: Box, Discrete and MultiDiscrete are")
+    if isinstance(space, spaces.MultiBinary):
+        return MultiCategorical([2] * space.shape[0], shape=(num_envs, space.shape[0]))
+    raise UserError(f"action space {space} is not supported: Box, Discrete, MultiDiscrete and MultiBinary are")

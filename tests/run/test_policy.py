@@ -4,6 +4,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from tensordict.nn import TensorDictModule
 
 from pgkit import run
 from pgkit.errors import UserError
@@ -38,6 +39,15 @@ def test_best_and_latest_are_different_weights(run_dir: Path):
     obs = np.array([0.5, 0.5])
     assert run.load_policy(run_dir, "best").predict(obs) == 0.25
     assert run.load_policy(run_dir, "latest").predict(obs) == 0.5
+
+
+def test_the_entries_of_a_dict():
+    actor = TensorDictModule(lambda a, b: a.sum(-1, keepdim=True) + b, ["a", "b"], ["action"])
+    policy = run.Policy(actor, lambda: None, {"a": (2,), "b": (1,)}, None, None)
+    np.testing.assert_array_equal(policy.predict({"a": np.array([1.0, 2.0]), "b": np.array([0.5])}), [3.5])
+    np.testing.assert_array_equal(policy.predict({"a": np.ones((3, 2)), "b": np.ones((3, 1))}), [[3.0]] * 3)
+    with pytest.raises(UserError, match="predict got a; the policy takes the entries a, b"):
+        policy.predict({"a": np.ones(2)})
 
 
 def test_a_wrong_shape_and_a_wrong_directory(run_dir: Path, tmp_path: Path):
