@@ -6,7 +6,7 @@ from pgkit.modules.deterministic import deterministic_actor
 from pgkit.modules.discrete import categorical_actor
 from pgkit.modules.discrete_q_values import discrete_q_value
 from pgkit.modules.encoders import dict_encoder
-from pgkit.modules.ensemble import EnsembleBatchRenorm, EnsembleLayerNorm, EnsembleLinear
+from pgkit.modules.ensemble import EnsembleBatchRenorm, EnsembleDropout, EnsembleLayerNorm, EnsembleLinear
 from pgkit.modules.exploration import GaussianExploration, OrnsteinUhlenbeck
 from pgkit.modules.mlp import mlp
 from pgkit.modules.normalizers import ObsNormalizer, ReturnScale
@@ -17,6 +17,7 @@ from pgkit.modules.values import state_value
 __all__ = [
     "Encoder",
     "EnsembleBatchRenorm",
+    "EnsembleDropout",
     "EnsembleLayerNorm",
     "EnsembleLinear",
     "GaussianExploration",

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
-from pgkit.modules.ensemble import EnsembleBatchRenorm, EnsembleLayerNorm, EnsembleLinear
+from pgkit.modules.ensemble import EnsembleBatchRenorm, EnsembleDropout, EnsembleLayerNorm, EnsembleLinear
 from pgkit.modules.sizes import observation_size
 
 Layers = tuple[list[nn.Module], int]
@@ -37,7 +37,7 @@ def ensemble_mlp(
     layers: list[nn.Module] = []
     for size in hidden:
         layers.append(EnsembleLinear(num, features, size, gain=2**0.5))
-        layers += [nn.Dropout(dropout)] if dropout else []
+        layers += [EnsembleDropout(dropout)] if dropout else []
         layers += [norm(num, size)] if norm else []
         layers.append(activation())
         features = size

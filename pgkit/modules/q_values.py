@@ -81,6 +81,7 @@ class CriticEnsemble(nn.Module):
         if self.normalizer is not None:
             observation = self.normalizer(observation)
         x = torch.cat([observation, action], -1)
-        critics = self.layers[-1].weight.shape[0]
+        last: Any = self.layers[-1]
+        critics = last.weight.shape[0]  # fewer than there are, where only some members are evaluated
         out = self.layers(x.reshape(-1, x.shape[-1]).expand(critics, -1, -1)).transpose(0, 1)
         return (out.squeeze(-1) if self.scalar else out).reshape(*x.shape[:-1], *out.shape[1 : 2 if self.scalar else 3])

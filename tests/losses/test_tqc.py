@@ -57,7 +57,8 @@ def test_values_by_hand():
     )
     SoftUpdate(loss, tau=0.1)
     data = batch(4)
-    data["next", "reward"].fill_(1.0), data["next", "terminated"].fill_(False)
+    data["next", "reward"].fill_(1.0)
+    data["next", "terminated"].fill_(False)
     out = loss(data)
     assert out["loss_qvalue"].item() == pytest.approx(0.375 + 1.09375)
     assert out["loss_actor"].item() == -4.0

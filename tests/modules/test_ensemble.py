@@ -46,7 +46,8 @@ def test_members_alone_give_what_they_give_among_the_others(block):
 
 def test_layer_norm_is_that_of_each_member():
     norm = modules.EnsembleLayerNorm(2, 6)
-    nn.init.normal_(norm.weight), nn.init.normal_(norm.bias)
+    nn.init.normal_(norm.weight)
+    nn.init.normal_(norm.bias)
     x = torch.randn(2, 5, 6) * 3 + 1
     for k in range(2):
         torch.testing.assert_close(norm(x)[k], F.layer_norm(x[k], (6,), norm.weight[k, 0], norm.bias[k, 0]))
@@ -66,11 +67,29 @@ def test_dropout_differs_across_members_and_rows_and_is_off_in_evaluation():
     assert torch.equal(net(data.copy())["state_action_value"], net(data.copy())["state_action_value"])
 
 
+@pytest.mark.parametrize("p", [0.01, 0.1, 0.5])
+def test_zeros_of_dropout_are_as_many_as_they_should_be_and_independent(p):
+    torch.manual_seed(0)
+    dropout, ones = modules.EnsembleDropout(p), torch.ones(2, 1000, 500)
+    out = dropout(ones)
+    assert out.unique().tolist() == pytest.approx([0, 1 / (1 - p)])
+    a, b = out == 0, dropout(ones) == 0
+    corners = [a[:, i : i + 500, j : j + 250] for i in (0, 500) for j in (0, 250)]
+    both = [a & b, a[0] & a[1], corners[0] & corners[1], corners[0] & corners[2], corners[0] & corners[3]]
+    three, four = corners[0] & corners[1] & corners[2], corners[0] & corners[1] & corners[2] & corners[3]
+    for zeros, probability in ((a, p), *((pair, p**2) for pair in both), (three, p**3), (four, p**4)):
+        deviation = (probability * (1 - probability) / zeros.numel()) ** 0.5
+        assert abs(zeros.double().mean().item() - probability) < 5 * deviation + 1e-5
+    for dim, size in ((1, 1000), (2, 500)):  # the number of zeros in a column and in a row is binomial
+        assert a.double().mean(dim).std().item() == pytest.approx((p * (1 - p) / size) ** 0.5, rel=0.12)
+
+
 def test_batch_renorm_by_hand():
     # x = 1, 3: mean 2, variance 1. running mean 1, variance 4: std 2. r = 1/2, d = (2 - 1)/2 = 1/2
     # y = -1 * 1/2 + 1/2 = 0 and 1 * 1/2 + 1/2 = 1, which is (x - 1) / 2: within the bounds, renorm is the running norm
     norm = modules.EnsembleBatchRenorm(1, 1, momentum=0.25, eps=0.0, warmup=0).double()
-    norm.mean.fill_(1), norm.var.fill_(4)
+    norm.mean.fill_(1)
+    norm.var.fill_(4)
     x = torch.tensor([[[1.0], [3.0]]], dtype=torch.float64)
     assert norm(x).flatten().tolist() == [0, 1]
     # 1 + (2 - 1)/4, 4 + (1 - 4)/4

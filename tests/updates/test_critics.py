@@ -82,7 +82,8 @@ def test_the_compiled_step_draws_anew_each_time(block):
             module.low = module.high = -20.0  # a policy without noise
     for target in update.loss.target_qvalue_network_params.values(True, True):
         target.data.add_(torch.randn_like(target))  # critics that differ
-    update.buffer.extend(collector.rollout()), update.buffer.extend(collector.rollout())
+    for _ in range(2):
+        update.buffer.extend(collector.rollout())
     index = update.buffer.sample_index(32)[0]
     update.train(1)
     values = {round(update._steps[True](update.buffer.data, index)[1].item(), 4) for _ in range(30)}
