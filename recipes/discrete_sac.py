@@ -79,8 +79,8 @@ class Args(run.RunArgs):
 
 PRESETS = {
     "CartPole-*": dict(
-        total_frames=100_000, eval_every=10_000, num_envs=4, updates_per_step=0.25, hidden=(64, 64), threads=1,
-        learning_rate=1e-3, q_learning_rate=1e-3, alpha_learning_rate=1e-3, target_entropy_weight=0.5,
+        total_frames=100_000, eval_every=10_000, num_envs=4, updates_per_step=0.5, hidden=(64, 64), threads=1,
+        learning_rate=1e-3, q_learning_rate=1e-3, alpha_learning_rate=1e-3, target_entropy_weight=0.2, tau=0.05,
         buffer_size=100_000,
     ),
 }  # fmt: skip
