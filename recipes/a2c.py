@@ -27,7 +27,7 @@ class Args(run.RunArgs):
     steps: int = 8
     """Steps each env takes for one rollout, on which one gradient step is taken."""
     learning_rate: float = 7e-4
-    """RMSprop's step size."""
+    """Adam's step size."""
     anneal: bool = True
     """Let the learning rate fall to zero in a straight line."""
     gamma: float = 0.99
@@ -55,11 +55,14 @@ class Args(run.RunArgs):
 
 
 PRESETS = {
-    "CartPole-*": dict(total_frames=300_000, eval_every=50_000, normalize_obs=False, scale_returns=False),
+    "CartPole-*": dict(
+        total_frames=300_000, eval_every=50_000, steps=16, learning_rate=2e-3, lmbda=0.95, normalize_advantage=True,
+        normalize_obs=False,
+    ),
     "HalfCheetah-*": dict(lmbda=0.95),
     "dm_control/*": dict(),
     "dmc:*": dict(),
-}
+}  # fmt: skip
 
 
 def main(args: Args) -> None:
@@ -87,7 +90,7 @@ def main(args: Args) -> None:
         update = updates.OnPolicyUpdate(
             loss=loss,
             advantage=advantage,
-            optimizer=torch.optim.RMSprop(parameters, lr=args.learning_rate, eps=1e-5),
+            optimizer=torch.optim.Adam(parameters, lr=args.learning_rate, eps=1e-5),
             epochs=1,
             minibatch_size=None,
             max_grad_norm=args.max_grad_norm,
@@ -107,7 +110,7 @@ def main(args: Args) -> None:
             if normalizer is not None:
                 normalizer.update(rollout["observation"])
             if scale is not None:
-                scale.update(rollout["value_target"])
+                scale.update(rollout["value_target"], critic)
             compile_seconds = update.compile_seconds + collector.compile_seconds
             log.step(collector.frames, rollout, metrics, compile_seconds=compile_seconds)
         collector.shutdown()

@@ -14,7 +14,7 @@ MAY_IMPORT = {
     "advantages": {"functional", "torch", "tensordict", "torchrl"},
     "controllers": {"functional", "torch"},
     "losses": {"functional", "heads", "torch", "tensordict", "torchrl"},
-    "updates": {"data", "torch", "tensordict"},
+    "updates": {"functional", "data", "torch", "tensordict"},
     "data": {"torch", "tensordict", "torchrl"},
     "collectors": {"envs", "torch", "tensordict", "torchrl"},
     "envs": {"gymnasium", "torch", "tensordict", "torchrl"},

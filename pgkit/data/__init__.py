@@ -2,6 +2,12 @@
 
 from pgkit.data.files import BesideCheckpoint
 from pgkit.data.prioritized import Prioritized
+from pgkit.data.recent import Recent
 from pgkit.data.replay import ReplayBuffer
 
-__all__ = ["BesideCheckpoint", "Prioritized", "ReplayBuffer"]
+__all__ = [
+    "BesideCheckpoint",
+    "Prioritized",
+    "Recent",
+    "ReplayBuffer",
+]

@@ -4,5 +4,12 @@ from pgkit.updates.off_policy import OffPolicyUpdate
 from pgkit.updates.on_policy import OnPolicyUpdate
 from pgkit.updates.optimizers import Together
 from pgkit.updates.step import GradientStep
+from pgkit.updates.trust_region import TrustRegionUpdate
 
-__all__ = ["GradientStep", "OffPolicyUpdate", "OnPolicyUpdate", "Together"]
+__all__ = [
+    "GradientStep",
+    "OffPolicyUpdate",
+    "OnPolicyUpdate",
+    "Together",
+    "TrustRegionUpdate",
+]

@@ -1,0 +1,137 @@
+"""IMPALA on one machine: worker processes with stale policies, one learner, V-trace; continuous and discrete actions.
+
+The defaults are the MuJoCo settings; tuned values for other environments are in ``PRESETS`` below.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Literal
+
+import torch
+
+from pgkit import advantages, collectors, controllers, envs, losses, modules, run, updates
+
+
+@dataclass
+class Args(run.RunArgs):
+    """Settings of IMPALA."""
+
+    env_id: str = "HalfCheetah-v5"
+    """Gymnasium id, or dm_control/<domain>-<task>-v0."""
+    total_frames: int = 1_000_000
+    """Env steps to train for, all envs together."""
+    eval_every: int = 100_000
+    """Evaluate and save a checkpoint every so many frames; 0 = only at the end."""
+    num_envs: int = 8
+    """Envs, all workers together."""
+    workers: int = 2
+    """Processes that collect, each a rollout of its own envs at a time."""
+    steps: int = 32
+    """Steps each env takes for one rollout, on which one gradient step is taken."""
+    max_lag: int | None = None
+    """Bound of a rollout's lag in updates; None is twice the workers. At the workers' number runs repeat themselves."""
+    delay: int = 0
+    """Collect with the weights of so many updates ago: forced lag, to study it."""
+    correction: Literal["vtrace", "none"] = "vtrace"
+    """V-trace, or GAE as if the rollout were the present policy's (A3C's way)."""
+    learning_rate: float = 7e-4
+    """Adam's step size."""
+    anneal: bool = True
+    """Let the learning rate fall to zero in a straight line."""
+    gamma: float = 0.99
+    """Discount."""
+    lmbda: float = 1.0
+    """Weight of the long returns; 1 is the paper's."""
+    rho_thresh: float = 1.0
+    """Bound of a step's importance weight."""
+    c_thresh: float = 1.0
+    """Bound of the weight that carries a later step's error back."""
+    entropy_coeff: float = 0.0
+    """Weight of the entropy bonus."""
+    critic_coeff: float = 0.5
+    """Weight of the value loss."""
+    max_grad_norm: float = 0.5
+    """Bound of the gradient's norm."""
+    normalize_advantage: bool = False
+    """Standardize the advantage over the rollout."""
+    normalize_obs: bool = True
+    """Normalize observations by their running mean and deviation."""
+    scale_returns: bool = True
+    """Let the critic learn returns divided by their running deviation; rewards stay as they are."""
+    hidden: tuple[int, ...] = (64, 64)
+    """Sizes of the hidden layers, of actor and critic alike."""
+    log_std: float = -0.5
+    """Initial log standard deviation of a continuous policy."""
+
+
+PRESETS = {
+    "CartPole-*": dict(
+        total_frames=300_000, eval_every=50_000, steps=32, learning_rate=2e-3, lmbda=0.95, normalize_advantage=True,
+        normalize_obs=False,
+    ),
+    "HalfCheetah-*": dict(lmbda=0.95),
+    "dm_control/*": dict(),
+    "dmc:*": dict(),
+}  # fmt: skip
+
+
+def main(args: Args) -> None:
+    """Trains, logs, evaluates, saves."""
+    with run.Run(args, recipe="impala") as log:
+        env = envs.make(args.env_id, num_envs=args.num_envs, seed=args.seed, workers=args.workers)
+        normalizer = modules.ObsNormalizer(env) if args.normalize_obs else None
+        scale = modules.ReturnScale() if args.scale_returns else None
+
+        if env.action_spec.dtype.is_floating_point:
+            actor = modules.gaussian_actor(env, args.hidden, log_std=args.log_std, normalizer=normalizer)
+        else:
+            actor = modules.categorical_actor(env, args.hidden, normalizer=normalizer)
+        critic = modules.state_value(env, args.hidden, normalizer=normalizer)
+
+        loss = losses.A2CLoss(actor, critic, entropy_coeff=args.entropy_coeff, critic_coeff=args.critic_coeff)
+        settings = {"gamma": args.gamma, "lmbda": args.lmbda, "return_scale": scale}
+        if args.correction == "vtrace":
+            thresholds = {"rho_thresh": args.rho_thresh, "c_thresh": args.c_thresh}
+            advantage = advantages.VTrace(critic, actor, **settings, **thresholds, standardize=args.normalize_advantage)
+        else:
+            advantage = advantages.GAE(critic, **settings, average_gae=args.normalize_advantage)
+        parameters = [*actor.parameters(), *critic.parameters()]
+        update = updates.OnPolicyUpdate(
+            loss=loss,
+            advantage=advantage,
+            optimizer=torch.optim.Adam(parameters, lr=args.learning_rate, eps=1e-5),
+            epochs=1,
+            minibatch_size=None,
+            max_grad_norm=args.max_grad_norm,
+            schedules={"lr": controllers.linear(args.learning_rate)} if args.anneal else None,
+            total_frames=args.total_frames,
+            compile=args.compile,
+        )
+        collector = collectors.AsyncCollector(
+            env,
+            actor,
+            frames_per_batch=args.num_envs // args.workers * args.steps,
+            total_frames=args.total_frames,
+            per_worker=True,
+            max_lag=args.max_lag,
+            delay=args.delay,
+            compile=args.compile,
+        )
+
+        log.track(policy=actor, eval_env=partial(envs.make, args.env_id), update=update, collector=collector)
+        for rollout in collector:
+            metrics = update(rollout)
+            metrics["policy_lag"] = collector.lag
+            if normalizer is not None:
+                normalizer.update(rollout["observation"])
+            if scale is not None:
+                scale.update(rollout["value_target"], critic)
+            compile_seconds = update.compile_seconds + collector.compile_seconds
+            log.step(collector.frames, rollout, metrics, compile_seconds=compile_seconds)
+        collector.shutdown()
+
+
+if __name__ == "__main__":
+    run.launch(main, Args, PRESETS)

@@ -1,0 +1,114 @@
+"""REINFORCE with or without a learned baseline, for continuous and discrete actions.
+
+The defaults are the MuJoCo settings; tuned values for other environments are in ``PRESETS`` below.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Literal
+
+import torch
+
+from pgkit import advantages, collectors, controllers, envs, losses, modules, run, updates
+
+
+@dataclass
+class Args(run.RunArgs):
+    """Settings of REINFORCE."""
+
+    env_id: str = "HalfCheetah-v5"
+    """Gymnasium id, or dm_control/<domain>-<task>-v0."""
+    total_frames: int = 1_000_000
+    """Env steps to train for, all envs together."""
+    eval_every: int = 100_000
+    """Evaluate and save a checkpoint every so many frames; 0 = only at the end."""
+    steps: int = 256
+    """Steps each env takes for one rollout, on which one gradient step is taken."""
+    learning_rate: float = 3e-3
+    """Adam's step size."""
+    anneal: bool = True
+    """Let the learning rate fall to zero in a straight line."""
+    gamma: float = 0.99
+    """Discount."""
+    baseline: bool = True
+    """Subtract a learned value from the return, which also stands for what the rollout does not show."""
+    reward_to_go: bool = True
+    """Weigh an action by the rewards after it; off: by those of the whole episode."""
+    max_grad_norm: float = 0.5
+    """Bound of the gradient's norm."""
+    normalize_advantage: bool = True
+    """Standardize the advantage over the rollout."""
+    normalize_obs: bool = True
+    """Normalize observations by their running mean and deviation."""
+    scale_returns: bool = True
+    """Let the critic learn returns divided by their running deviation; rewards stay as they are."""
+    hidden: tuple[int, ...] = (64, 64)
+    """Sizes of the hidden layers, of actor and critic alike."""
+    log_std: float = -0.5
+    """Initial log standard deviation of a continuous policy."""
+    collector: Literal["pgkit", "torchrl"] = "pgkit"
+    """pgkit's VectorCollector, or torchrl.collectors.Collector."""
+
+
+PRESETS = {
+    "CartPole-*": dict(total_frames=300_000, eval_every=50_000, steps=32, learning_rate=5e-3, normalize_obs=False),
+    "dm_control/*": dict(),
+    "dmc:*": dict(),
+}
+
+
+def main(args: Args) -> None:
+    """Trains, logs, evaluates, saves."""
+    with run.Run(args, recipe="reinforce") as log:
+        env = envs.make(args.env_id, num_envs=args.num_envs, seed=args.seed, workers=args.workers)
+        normalizer = modules.ObsNormalizer(env) if args.normalize_obs else None
+        scale = modules.ReturnScale() if args.scale_returns and args.baseline else None
+
+        if env.action_spec.dtype.is_floating_point:
+            actor = modules.gaussian_actor(env, args.hidden, log_std=args.log_std, normalizer=normalizer)
+        else:
+            actor = modules.categorical_actor(env, args.hidden, normalizer=normalizer)
+        critic = modules.state_value(env, args.hidden, normalizer=normalizer) if args.baseline else None
+
+        loss = losses.ReinforceLoss(actor, critic)
+        advantage = advantages.MonteCarlo(
+            critic,
+            gamma=args.gamma,
+            reward_to_go=args.reward_to_go,
+            standardize=args.normalize_advantage,
+            return_scale=scale,
+        )
+        parameters = [*actor.parameters(), *([] if critic is None else critic.parameters())]
+        update = updates.OnPolicyUpdate(
+            loss=loss,
+            advantage=advantage,
+            optimizer=torch.optim.Adam(parameters, lr=args.learning_rate),
+            epochs=1,
+            minibatch_size=None,
+            max_grad_norm=args.max_grad_norm,
+            schedules={"lr": controllers.linear(args.learning_rate)} if args.anneal else None,
+            total_frames=args.total_frames,
+            compile=args.compile,
+        )
+        sizes = {"frames_per_batch": args.num_envs * args.steps, "total_frames": args.total_frames}
+        if args.collector == "pgkit":
+            collector = collectors.VectorCollector(env, actor, **sizes, compile=args.compile)
+        else:
+            collector = collectors.TorchRLCollector(env, actor, **sizes)
+
+        log.track(policy=actor, eval_env=partial(envs.make, args.env_id), update=update, collector=collector)
+        for rollout in collector:
+            metrics = update(rollout)
+            if normalizer is not None:
+                normalizer.update(rollout["observation"])
+            if scale is not None:
+                scale.update(rollout["value_target"], critic)
+            compile_seconds = update.compile_seconds + collector.compile_seconds
+            log.step(collector.frames, rollout, metrics, compile_seconds=compile_seconds)
+        collector.shutdown()
+
+
+if __name__ == "__main__":
+    run.launch(main, Args, PRESETS)

@@ -1,0 +1,128 @@
+"""Trust-region policy optimization, and the natural policy gradient, for continuous and discrete actions.
+
+The defaults are the MuJoCo settings; tuned values for other environments are in ``PRESETS`` below.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Literal
+
+import torch
+
+from pgkit import advantages, collectors, envs, losses, modules, run, updates
+
+
+@dataclass
+class Args(run.RunArgs):
+    """Settings of TRPO."""
+
+    env_id: str = "HalfCheetah-v5"
+    """Gymnasium id, or dm_control/<domain>-<task>-v0."""
+    total_frames: int = 1_000_000
+    """Env steps to train for, all envs together."""
+    eval_every: int = 100_000
+    """Evaluate and save a checkpoint every so many frames; 0 = only at the end."""
+    steps: int = 256
+    """Steps each env takes for one rollout."""
+    max_kl: float = 0.01
+    """Bound of the mean KL divergence of a step."""
+    natural_gradient: bool = False
+    """Take the full step without a line search: the natural policy gradient."""
+    cg_steps: int = 10
+    """Steps of conjugate gradients toward the natural gradient."""
+    damping: float = 0.1
+    """Added to the diagonal of the Fisher matrix."""
+    backtracks: int = 10
+    """Shorter steps that the line search tries, each 0.8 times the one before."""
+    critic_epochs: int = 10
+    """Passes of the critic over a rollout."""
+    minibatch_size: int = 64
+    """Rows of a minibatch of the critic."""
+    learning_rate: float = 1e-3
+    """Adam's step size, for the critic."""
+    gamma: float = 0.99
+    """Discount."""
+    lmbda: float = 0.95
+    """GAE's lambda."""
+    entropy_coeff: float = 0.0
+    """Weight of the entropy bonus."""
+    normalize_obs: bool = True
+    """Normalize observations by their running mean and deviation."""
+    scale_returns: bool = True
+    """Let the critic learn returns divided by their running deviation; rewards stay as they are."""
+    hidden: tuple[int, ...] = (64, 64)
+    """Sizes of the hidden layers, of actor and critic alike."""
+    log_std: float = -0.5
+    """Initial log standard deviation of a continuous policy."""
+    collector: Literal["pgkit", "torchrl"] = "pgkit"
+    """pgkit's VectorCollector, or torchrl.collectors.Collector."""
+
+
+PRESETS = {
+    "CartPole-*": dict(
+        total_frames=100_000, eval_every=25_000, steps=64, max_kl=0.02, gamma=0.98, lmbda=0.9,
+        normalize_obs=False,
+    ),
+    "HalfCheetah-*": dict(lmbda=0.9),
+    "dm_control/*": dict(),
+    "dmc:*": dict(),
+}  # fmt: skip
+
+
+def main(args: Args) -> None:
+    """Trains, logs, evaluates, saves."""
+    with run.Run(args, recipe="trpo") as log:
+        env = envs.make(args.env_id, num_envs=args.num_envs, seed=args.seed, workers=args.workers)
+        normalizer = modules.ObsNormalizer(env) if args.normalize_obs else None
+        scale = modules.ReturnScale() if args.scale_returns else None
+
+        if env.action_spec.dtype.is_floating_point:
+            actor = modules.gaussian_actor(env, args.hidden, log_std=args.log_std, normalizer=normalizer)
+        else:
+            actor = modules.categorical_actor(env, args.hidden, normalizer=normalizer)
+        critic = modules.state_value(env, args.hidden, normalizer=normalizer)
+
+        loss = losses.TRPOLoss(actor, critic, entropy_coeff=args.entropy_coeff)
+        advantage = advantages.GAE(
+            critic,
+            gamma=args.gamma,
+            lmbda=args.lmbda,
+            average_gae=True,
+            return_scale=scale,
+        )
+        update = updates.TrustRegionUpdate(
+            loss=loss,
+            advantage=advantage,
+            optimizer=torch.optim.Adam(critic.parameters(), lr=args.learning_rate),
+            max_kl=args.max_kl,
+            line_search=not args.natural_gradient,
+            cg_steps=args.cg_steps,
+            damping=args.damping,
+            backtracks=args.backtracks,
+            epochs=args.critic_epochs,
+            minibatch_size=args.minibatch_size,
+            total_frames=args.total_frames,
+            compile=args.compile,
+        )
+        sizes = {"frames_per_batch": args.num_envs * args.steps, "total_frames": args.total_frames}
+        if args.collector == "pgkit":
+            collector = collectors.VectorCollector(env, actor, **sizes, compile=args.compile)
+        else:
+            collector = collectors.TorchRLCollector(env, actor, **sizes)
+
+        log.track(policy=actor, eval_env=partial(envs.make, args.env_id), update=update, collector=collector)
+        for rollout in collector:
+            metrics = update(rollout)
+            if normalizer is not None:
+                normalizer.update(rollout["observation"])
+            if scale is not None:
+                scale.update(rollout["value_target"])
+            compile_seconds = update.compile_seconds + collector.compile_seconds
+            log.step(collector.frames, rollout, metrics, compile_seconds=compile_seconds)
+        collector.shutdown()
+
+
+if __name__ == "__main__":
+    run.launch(main, Args, PRESETS)
