@@ -30,6 +30,11 @@ class Loss(LossModule):
         super().__init__()
         self.reduction = "mean" if reduction is None else reduction
 
+    def __getattr__(self, item: str) -> Any:
+        if item.startswith("target_") and item.endswith("_params") and self._modules.get(item) is None:
+            return getattr(self, item.removeprefix("target_")).detach()  # LossModule's .data is hidden from a recording
+        return super().__getattr__(item)
+
     def _reads(self) -> list[NestedKey]:
         """Every entry that ``forward`` reads; a key may come twice."""
         raise NotImplementedError

@@ -18,6 +18,9 @@ Draw = tuple[TensorDictBase, Tensor]
 class Batches(Protocol):
     """A source of batches for :class:`~pgkit.updates.GradientStep`."""
 
+    record: bool
+    """Whether a step on them writes into nothing but the loss and the optimizer, so that it can be recorded."""
+
     def extend(self, rollout: TensorDictBase) -> None:
         """Stores a rollout."""
         ...
@@ -47,7 +50,7 @@ class OwnBatches:
     """From pgkit's replay: only row numbers are drawn, the rest is in the graph."""
 
     def __init__(self, buffer: ReplayBuffer, loss: nn.Module, batch_size: int) -> None:
-        self.buffer, self.batch_size = buffer, batch_size
+        self.buffer, self.batch_size, self.record = buffer, batch_size, buffer.sampler is None
         self._gather = buffer.gather(discount(loss) if buffer.n_steps > 1 else 1.0)
 
     def extend(self, rollout: TensorDictBase) -> None:
@@ -76,7 +79,7 @@ class TorchRLBatches:
     """From a TorchRL replay buffer: its ``sample()`` is called for every step, ``td_error`` is written back to it."""
 
     def __init__(self, buffer: Any, loss: nn.Module, batch_size: int) -> None:
-        self.buffer, self.loss, self.batch_size = buffer, loss, batch_size
+        self.buffer, self.loss, self.batch_size, self.record = buffer, loss, batch_size, False
         self.priority = getattr(loss.tensor_keys, "priority", "td_error")
         self.prioritized = (
             hasattr(getattr(buffer, "sampler", None), "update_priority")

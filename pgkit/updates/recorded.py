@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 
 from pgkit.compiling import compile_record, record
@@ -22,7 +22,7 @@ def recorded(step: Step, held: Sequence[Tensor], data: TensorDictBase, index: Te
     Args:
         step: changes tensors of ``held`` in place, and no others.
         held: parameters, buffers, optimizer state and learning rates, each once.
-        data: example rows ``[rows]``.
+        data: what the step indexes, nested or not.
         index: example indices ``[B]``.
 
     Raises:
@@ -33,7 +33,10 @@ def recorded(step: Step, held: Sequence[Tensor], data: TensorDictBase, index: Te
 
     def flat(*inputs: Tensor) -> list[Tensor]:
         leaves = dict(zip(keys, inputs[len(held) : -1], strict=True))
-        metrics, grads = step(TensorDict({}, data.batch_size).update(leaves), inputs[-1])
+        rows = data.copy()  # of nested TensorDicts too, so that ``data`` stays as it is
+        for key, leaf in leaves.items():
+            rows.set(key, leaf)
+        metrics, grads = step(rows, inputs[-1])
         return [metrics, *grads]
 
     before = [tensor.detach().clone() for tensor in held]
@@ -67,7 +70,7 @@ def recorded(step: Step, held: Sequence[Tensor], data: TensorDictBase, index: Te
         return metrics, grads
 
     # a decision taken on values outside torch (numpy) is not seen while recording: it would show on other rows
-    other = torch.randperm(len(data), generator=torch.Generator().manual_seed(0))[: len(index)].to(index.device)
+    other = (index + 1) % (index.max() + 1)
     expected, got = (undone(lambda f=f: f(data, other)[0]) for f in (step, run))
     if not torch.allclose(got, expected, rtol=1e-3, atol=1e-4, equal_nan=True):
         raise RuntimeError(f"the recorded step does not repeat the step on other rows: {got} is not {expected}")

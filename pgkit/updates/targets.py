@@ -20,7 +20,7 @@ def target_pairs(loss: nn.Module) -> list[tuple[Tensor, Tensor]]:
     for name, target in loss.named_children():
         if name.startswith("target_") and name.endswith("_params"):
             source = getattr(loss, name.removeprefix("target_"))
-            pairs += [(target.get(key).data, source.get(key)) for key in target.keys(True, True)]
+            pairs += [(target.get(key), source.get(key)) for key in target.keys(True, True)]
     apart = [(target, source) for target, source in pairs if target.data_ptr() != source.data_ptr()]
     # a compiled graph loses writes to a float64 scalar (a normalizer's count): a scalar buffer is a vector of one here
     scalar = [target.dim() == 0 and not source.requires_grad for target, source in apart]
