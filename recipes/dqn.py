@@ -39,6 +39,8 @@ class Args(run.RunArgs):
     """Adam's step size."""
     max_grad_norm: float | None = 10.0
     """Bound of the gradient's norm; None is none."""
+    loss_function: Literal["smooth_l1", "l2"] = "smooth_l1"
+    """Distance of value and target."""
     gamma: float = 0.99
     """Discount."""
     tau: float = 0.005
@@ -71,14 +73,16 @@ def main(args: Args) -> None:
     with run.Run(args, recipe="dqn") as log:
         make_env = partial(envs.make, args.env_id)
         env = make_env(num_envs=args.num_envs, seed=args.seed, workers=args.workers)
-        if not hasattr(env.action_spec_unbatched.space, "n"):
+        actions = getattr(env.action_spec_unbatched.space, "n", None)
+        if actions is None:
             raise UserError(f"dqn needs one discrete action, '{args.env_id}' has another action space: use sac or td3")
-        sizes = (env.observation_spec_unbatched["observation"].shape[-1], env.action_spec_unbatched.space.n)
+        sizes = (env.observation_spec_unbatched["observation"].shape[-1], actions)
         net = modules.mlp(*sizes, args.hidden, torch.nn.ReLU)
         actor = QValueActor(net, in_keys=["observation"], action_space="categorical")
         explore = EGreedyModule(env.action_spec, 1.0, args.epsilon_end, args.epsilon_frames)
 
-        loss = DQNLoss(actor, action_space="categorical", delay_value=True, double_dqn=args.double)
+        settings = {"loss_function": args.loss_function, "double_dqn": args.double}
+        loss = DQNLoss(actor, action_space="categorical", delay_value=True, **settings)
         loss.make_value_estimator(gamma=args.gamma)
         buffer = data.ReplayBuffer(
             env,

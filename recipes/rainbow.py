@@ -105,9 +105,10 @@ def main(args: Args) -> None:
     with run.Run(args, recipe="rainbow") as log:
         make_env = partial(envs.make, args.env_id)
         env = make_env(num_envs=args.num_envs, seed=args.seed, workers=args.workers)
-        if not hasattr(env.action_spec_unbatched.space, "n"):
+        actions = getattr(env.action_spec_unbatched.space, "n", None)
+        if actions is None:
             raise UserError(f"rainbow needs one discrete action, '{args.env_id}' has another action space: use sac")
-        sizes = (env.observation_spec_unbatched["observation"].shape[-1], env.action_spec_unbatched.space.n)
+        sizes = (env.observation_spec_unbatched["observation"].shape[-1], actions)
         net = DuelingNoisyNet(*sizes, args.atoms, args.hidden, args.noise)
         actor = DistributionalQValueActor(
             TensorDictModule(net, in_keys=["observation"], out_keys=["action_value"]),

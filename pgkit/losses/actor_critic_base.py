@@ -26,6 +26,7 @@ class ActorCriticLoss(PolicyLoss):
         normalize_advantage: zero mean and unit deviation within the minibatch.
         clip_value: clip the value's change to this distance from ``state_value``.
         entropy_bonus: False leaves entropy out altogether.
+        samples_mc_entropy: draws that estimate the entropy of a distribution without a closed form.
         separate_losses: parameters shared by actor and critic are trained by the policy's loss only.
         reduction: ``mean``, ``sum`` or ``none``.
     """
@@ -47,6 +48,7 @@ class ActorCriticLoss(PolicyLoss):
         normalize_advantage: bool = False,
         clip_value: float | None = None,
         entropy_bonus: bool = True,
+        samples_mc_entropy: int = 1,
         separate_losses: bool = False,
         reduction: str | None = None,
     ) -> None:
@@ -56,7 +58,7 @@ class ActorCriticLoss(PolicyLoss):
         self.register_coeff_buffer("critic_coeff", critic_coeff)
         self.register_coeff_buffer("clip_value", clip_value)
         self.loss_critic_type, self.normalize_advantage = loss_critic_type, normalize_advantage
-        self.entropy_bonus = entropy_bonus
+        self.entropy_bonus, self.samples_mc_entropy = entropy_bonus, samples_mc_entropy
 
     def get_advantage(self, batch: TensorDictBase) -> Tensor:
         """The batch's advantage ``[*B, 1]``, standardized over the batch if this loss does that."""

@@ -29,23 +29,25 @@ class ClipPPOLoss(ActorCriticLoss):
     Args:
         actor_network: probabilistic actor.
         critic_network: value operator; None leaves the value loss out.
-        clip_epsilon: :math:`\epsilon`, or a pair ``(low, high)``.
+        clip_epsilon: :math:`\epsilon`, the buffer ``clip_epsilon``; or a pair, the buffers ``clip_epsilon_low`` and
+            ``clip_epsilon_high``.
         surrogate: replaces the clipped surrogate: ``(log_ratio, advantage) -> objective``, unreduced, to be
             maximized, all ``[*B, 1]``.
         clip_value: clip the value's change to this distance from ``state_value``; True takes ``clip_epsilon``.
-        entropy_coeff, critic_coeff, loss_critic_type, normalize_advantage, entropy_bonus, separate_losses, reduction:
-            as in :class:`~pgkit.losses.ActorCriticLoss`.
+        entropy_coeff, critic_coeff, loss_critic_type, normalize_advantage, entropy_bonus, samples_mc_entropy,
+            separate_losses, reduction: as in :class:`~pgkit.losses.ActorCriticLoss`.
 
     Writes ``loss_objective``, ``loss_critic``, ``loss_entropy`` and the metrics ``entropy``, ``approx_kl``,
     ``clip_fraction``, ``explained_variance``.
     """
 
     _schedulable_buffers: ClassVar[frozenset[str]] = frozenset(
-        {"clip_low", "clip_high", "entropy_coeff", "critic_coeff", "clip_value"}
+        {"clip_epsilon", "clip_epsilon_low", "clip_epsilon_high", "entropy_coeff", "critic_coeff", "clip_value"}
     )
 
-    clip_low: Tensor
-    clip_high: Tensor
+    clip_epsilon: Tensor
+    clip_epsilon_low: Tensor
+    clip_epsilon_high: Tensor
 
     def __init__(
         self,
@@ -60,10 +62,12 @@ class ClipPPOLoss(ActorCriticLoss):
         normalize_advantage: bool = True,
         clip_value: bool | float | None = None,
         entropy_bonus: bool = True,
+        samples_mc_entropy: int = 1,
         separate_losses: bool = False,
         reduction: str | None = None,
     ) -> None:
-        low, high = clip_epsilon if isinstance(clip_epsilon, tuple | list) else (clip_epsilon, clip_epsilon)
+        pair = isinstance(clip_epsilon, tuple | list)
+        low, high = clip_epsilon if pair else (clip_epsilon, clip_epsilon)
         if clip_value is True and low != high:
             raise ValueError(
                 "clip_value=True takes clip_epsilon's value, which is a pair here: give clip_value a number"
@@ -72,11 +76,18 @@ class ClipPPOLoss(ActorCriticLoss):
             actor_network, critic_network, entropy_coeff=entropy_coeff, critic_coeff=critic_coeff,
             loss_critic_type=loss_critic_type, normalize_advantage=normalize_advantage,
             clip_value=low if clip_value is True else clip_value or None, entropy_bonus=entropy_bonus,
-            separate_losses=separate_losses, reduction=reduction,
+            samples_mc_entropy=samples_mc_entropy, separate_losses=separate_losses, reduction=reduction,
         )  # fmt: skip
-        self.register_coeff_buffer("clip_low", low)
-        self.register_coeff_buffer("clip_high", high)
+        self._clip_names = ("clip_epsilon_low", "clip_epsilon_high") if pair else ("clip_epsilon", "clip_epsilon")
+        for name, value in zip(self._clip_names[: 1 + pair], (low, high), strict=False):
+            self.register_coeff_buffer(name, value)
         self.surrogate = surrogate
+
+    @property
+    def clip_bounds(self) -> tuple[Tensor, Tensor]:
+        """How far the ratio may fall below 1 and rise above it."""
+        low, high = self._clip_names
+        return getattr(self, low), getattr(self, high)
 
     def _writes(self) -> list[NestedKey]:
         return ["loss_objective", *super()._writes(), "approx_kl", "clip_fraction"]
@@ -86,9 +97,9 @@ class ClipPPOLoss(ActorCriticLoss):
         """Losses and metrics of a batch ``[*B]`` with ``advantage`` ``[*B, 1]``."""
         batch = tensordict.copy()
         advantage, dist = self.get_advantage(batch), self.distribution(batch)
-        log_ratio = self.log_ratio(dist, batch)
+        log_ratio, (low, high) = self.log_ratio(dist, batch), self.clip_bounds
         if self.surrogate is None:
-            objective = clip_surrogate(log_ratio, advantage, self.clip_low, self.clip_high)
+            objective = clip_surrogate(log_ratio, advantage, low, high)
         else:
             objective = self.surrogate(log_ratio, advantage)
         same_shape(advantage=advantage, surrogate=objective)
@@ -99,5 +110,5 @@ class ClipPPOLoss(ActorCriticLoss):
 
         ratio = log_ratio.detach().exp()
         out["approx_kl"] = approx_kl(log_ratio.detach()).mean()
-        out["clip_fraction"] = ((ratio < 1 - self.clip_low) | (ratio > 1 + self.clip_high)).to(ratio.dtype).mean()
+        out["clip_fraction"] = ((ratio < 1 - low) | (ratio > 1 + high)).to(ratio.dtype).mean()
         return out

@@ -46,6 +46,7 @@ class PolicyLoss(Loss):
 
     default_keys = _AcceptedKeys
     default_value_estimator = ValueEstimators.GAE
+    samples_mc_entropy: int = 1
     critic_network: TensorDictModule | None
     critic_network_params: Any
     target_critic_network_params: Any
@@ -121,11 +122,13 @@ class PolicyLoss(Loss):
         return out.get(self.tensor_keys.value)
 
     def entropy(self, dist: Distribution) -> Tensor:
-        """Entropy ``[*B]``: closed form, or minus the log-probability of one reparametrized sample."""
+        """Entropy ``[*B]``: closed form, or minus the mean log-probability of ``samples_mc_entropy`` draws."""
         try:
             return dist.entropy()
         except NotImplementedError:
-            return -sample_and_log_prob(dist, reparameterize=dist.has_rsample)[1]
+            draws = range(self.samples_mc_entropy)
+            log_probs = [sample_and_log_prob(dist, reparameterize=dist.has_rsample)[1] for _ in draws]
+            return -torch.stack(log_probs).mean(0)
 
     def get_advantage(self, batch: TensorDictBase) -> Tensor:
         """The batch's advantage, computed by this loss's own estimator only if the user made one."""
@@ -151,11 +154,20 @@ class PolicyLoss(Loss):
             keys = {name: getattr(self.tensor_keys, name) for name in names}
             supported = {value_type: value_type.name}
             dispatch_value_estimator(self, value_type, supported=supported, tensor_keys=keys, **hp)
+        self._in_keys = None
         return self
 
     def _reads(self) -> list[NestedKey]:
         networks = [net for net in (self.actor_network, self.critic_network) if net is not None]
-        return [*[key for net in networks for key in net.in_keys], *self._read_keys()]
+        return [*[key for net in networks for key in net.in_keys], *self._read_keys(), *self._estimated_from()]
+
+    def _estimated_from(self) -> list[NestedKey]:
+        """Entries that the estimator made by :meth:`make_value_estimator` reads, if there is one."""
+        if self._value_estimator is None or self.critic_network is None:
+            return []
+        keys = self.tensor_keys
+        after = [*self.critic_network.in_keys, keys.reward, keys.done, keys.terminated]
+        return [("next", *((key,) if isinstance(key, str) else key)) for key in after]
 
     def _read_keys(self) -> list[NestedKey]:
         """Entries that ``forward`` reads besides the networks' inputs."""

@@ -136,6 +136,7 @@ class QLoss(Loss):
         atoms = next_value.reshape(*batch.batch_size, -1)
         reward, terminated = (after[key].expand_as(atoms) for key in (keys.reward, keys.terminated))
         steps = batch.get(keys.steps_to_next_obs, None)
+        steps = None if steps is None else steps.reshape(*batch.batch_size, 1)  # TorchRL's MultiStep drops the 1
         return bootstrap_target(reward, atoms, terminated, self.gamma, steps).reshape(next_value.shape)
 
     def weight(self, batch: TensorDictBase) -> Tensor | float:

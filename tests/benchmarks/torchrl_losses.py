@@ -4,7 +4,8 @@
 
 On-policy losses: 64 rows of a HalfCheetah rollout, 2x64 tanh nets, gradient norm clipped to 0.5. Off-policy losses:
 256 rows drawn from a replay of HalfCheetah frames (CartPole for discrete actions), 2x256 ReLU nets, soft targets.
-TorchRL's loop: Adam's ``step()`` and ``SoftUpdate.step()`` after ``backward()``, rows from its ``TensorDictReplayBuffer``.
+TorchRL's loop: Adam's ``step()`` and ``SoftUpdate.step()`` after ``backward()``, rows from its
+``TensorDictReplayBuffer``.
 """
 
 from collections.abc import Callable, Sequence
@@ -217,7 +218,8 @@ def main(options: Options) -> None:
     torch.manual_seed(0)
     print(f"{contest.machine()['text']}; {options.steps} steps, {options.threads} thread(s)\n")
     print(
-        "| TorchRL's loss | pgkit's update, ms | TorchRL's loop, ms | TorchRL / pgkit | pgkit's step |\n|---|---|---|---|---|"
+        "| TorchRL's loss | pgkit's update, ms | TorchRL's loop, ms | TorchRL / pgkit | pgkit's step |\n"
+        "|---|---|---|---|---|"
     )
     for name in options.losses or (*ON_POLICY, *OFF_POLICY):
         mine, theirs, ran = times(name, options.steps)

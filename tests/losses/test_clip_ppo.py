@@ -117,7 +117,8 @@ def test_torchrl_plumbing(agent):
     torch.testing.assert_close(loss(renamed)["loss_objective"], expected)
     loss.set_keys(advantage="advantage")
     renamed.rename_key_("my_advantage", "advantage")
-    values = loss(**{key: batch[key] for key in loss.in_keys})  # @dispatch: tensors in, tuple out
+    given = {key: batch[key] for key in loss.in_keys if key in batch.keys(True)}
+    values = loss(**given)  # @dispatch: tensors in, tuple out
     torch.testing.assert_close(values[loss.out_keys.index("loss_objective")], expected)
     loss.entropy_coeff = 0.5
     assert loss.entropy_coeff.item() == 0.5 and isinstance(loss.entropy_coeff, torch.Tensor)
@@ -132,3 +133,30 @@ def test_an_estimator_made_by_the_user_fills_in_the_advantage(agent):
     for key in ("done", "terminated"):
         batch["next", key] = torch.zeros(1, 8, 1, dtype=torch.bool)
     assert loss(batch)["loss_objective"].isfinite()
+
+
+def test_clip_epsilon_is_a_buffer_under_torchrl_s_names(agent):
+    env, actor, critic = agent
+    batch = make_batch(actor, env)
+    one, two = losses.ClipPPOLoss(actor, critic), losses.ClipPPOLoss(actor, critic, clip_epsilon=(0.1, 0.3))
+    assert {"clip_epsilon"} == {name for name, _ in one.named_buffers() if name.startswith("clip_epsilon")}
+    assert two.clip_epsilon_low.item() == pytest.approx(0.1) and two.clip_epsilon_high.item() == pytest.approx(0.3)
+    expected = losses.ClipPPOLoss(actor, critic, clip_epsilon=0.05)(batch)
+    one.clip_epsilon = 0.05  # what a schedule does
+    two.clip_epsilon_low = two.clip_epsilon_high = 0.05
+    for loss in (one, two):
+        out = loss(batch)
+        assert out["loss_objective"] == expected["loss_objective"] and out["clip_fraction"] == expected["clip_fraction"]
+
+
+def test_samples_mc_entropy_averages_draws(agent):
+    # a distribution without a closed form: the mean of n draws of -log p has a deviation smaller by sqrt(n)
+    from torchrl.modules import TanhNormal
+
+    dist = TanhNormal(torch.zeros(4000, 1), torch.ones(4000, 1), event_dims=1)
+    deviations = []
+    for samples in (1, 16):
+        loss = losses.ClipPPOLoss(agent[1], agent[2], samples_mc_entropy=samples)
+        torch.manual_seed(0)
+        deviations.append(loss.entropy(dist).std().item())
+    assert deviations[0] / deviations[1] == pytest.approx(4.0, rel=0.1)

@@ -5,7 +5,8 @@
 
 Before TorchRL's test files are imported, every class of ``torchrl.objectives`` that ``pgkit.losses`` has by the same
 name is replaced by pgkit's; the tests that name such a class are run, all others are left out. The tests are
-TorchRL's, unchanged, and stay where they are. What remains failed, and why: docs/pages/torchrl.md.
+TorchRL's, unchanged, and stay where they are. Keywords that pgkit's constructors do not have are dropped where they
+change nothing (``DROPPED`` below). What remains failed, and why: docs/pages/torchrl.md.
 """
 
 from __future__ import annotations
@@ -23,7 +24,27 @@ import torchrl.objectives
 
 from pgkit import losses
 
-SUBSTITUTES = {name: getattr(losses, name) for name in losses.__all__ if hasattr(torchrl.objectives, name)}
+DROPPED: dict[str, Any] = {
+    "device": None, "deactivate_vmap": None, "functional": True, "value_network": None, "delay_value": False,
+    "skip_done_states": False,
+}  # fmt: skip
+"""Keyword and the value at which it asks for nothing; None: at any value."""
+
+
+def adapted(cls: type) -> type:
+    """The class, with a constructor that drops the keywords above."""
+
+    def init(self: Any, *args: Any, **kwargs: Any) -> None:
+        kept = {name: x for name, x in kwargs.items() if name not in DROPPED or DROPPED[name] not in (None, x)}
+        if kwargs.get("value_network") is None:
+            kept.pop("delay_value", None)  # of the value network that is not there
+        cls.__init__(self, *args, **kept)
+
+    return type(cls.__name__, (cls,), {"__init__": init, "__module__": cls.__module__, "__doc__": cls.__doc__})
+
+
+NAMES = [name for name in losses.__all__ if hasattr(torchrl.objectives, name)]
+SUBSTITUTES = {name: adapted(getattr(losses, name)) for name in NAMES}
 
 
 def substitute(names: list[str]) -> None:

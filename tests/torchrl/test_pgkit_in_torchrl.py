@@ -40,6 +40,10 @@ def trainer(env, actor, loss, optimizer, steps=2, **kwargs):
     )  # fmt: skip
 
 
+def collected(env, actor):
+    return next(iter(Collector(env, actor, frames_per_batch=32, total_frames=32)))
+
+
 def weights(module):
     return torch.cat([p.detach().flatten() for p in module.parameters()])
 
@@ -98,7 +102,7 @@ def test_updaters_move_the_targets(updater):
 def test_group_optimizers_trains_each_network_at_its_rate():
     env, actor, loss = sac()
     SoftUpdate(loss, tau=0.005)
-    batch = Collector(env, actor, frames_per_batch=32, total_frames=32).next().reshape(-1)
+    batch = collected(env, actor).reshape(-1)
     optimizer = group_optimizers(
         torch.optim.Adam(actor.parameters(), lr=0.0), torch.optim.Adam(loss.qvalue_network_params.parameters(), lr=1e-2)
     )
@@ -115,7 +119,7 @@ def test_make_value_estimator_fills_in_the_advantage_as_torchrl_s_loss_would(est
 
     env, actor, critic, mine = ppo(normalize_advantage=False)
     theirs = TorchRLClipPPOLoss(actor, critic, loss_critic_type="l2", entropy_coeff=0.0)
-    batch = Collector(env, actor, frames_per_batch=32, total_frames=32).next()
+    batch = collected(env, actor)
     results = []
     for loss in (mine, theirs):
         loss.make_value_estimator(estimator, gamma=0.9)
@@ -127,7 +131,7 @@ def test_make_value_estimator_fills_in_the_advantage_as_torchrl_s_loss_would(est
 def test_set_keys_and_dispatch():
     env, actor, loss = sac()
     SoftUpdate(loss, tau=0.005)
-    batch = Collector(env, actor, frames_per_batch=32, total_frames=32).next().reshape(-1)
+    batch = collected(env, actor).reshape(-1)
     torch.manual_seed(1)
     expected = loss(batch.copy())
     loss.set_keys(reward="income")

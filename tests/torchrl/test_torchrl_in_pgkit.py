@@ -47,6 +47,7 @@ def train(name: str, compile: str) -> tuple[Any, dict[str, float], torch.Tensor]
         return update, update(rollout(agent, 64)), before
     agent = off_policy(name, SMALL)
     update = off_policy_update(agent, compile, batch_size=32)
+    update.optimizer.param_groups[0]["eps"] = 1e-3  # Adam makes a whole step of a gradient that is a rounding error
     before = weights(update).clone()
     update(rollout(agent, 128))
     torch.manual_seed(1)
@@ -72,7 +73,10 @@ def test_every_stock_loss_compiles_or_says_that_it_does_not(name, caplog):
     torch.testing.assert_close(weights(compiled), weights(eager), rtol=1e-2, atol=1e-3)
 
 
-EAGER: dict[str, str] = {}
+EAGER = {
+    "KLPENPPOLoss": "its forward adapts beta by an `if` on the value of the KL",
+    "DistributionalDQNLoss": "its forward checks values by an `if`, and reads the ends of the support as numbers",
+}
 """Stock losses that torch.compile cannot trace, and why."""
 
 

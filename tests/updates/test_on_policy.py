@@ -76,7 +76,7 @@ def test_compiled_step_follows_normalizers_coefficients_and_learning_rate():
             out.append(update(make_rollout(i)))
             normalizer.update(make_rollout(i)["observation"] * 3 + 1)
             update.loss.entropy_coeff = 0.1 * i
-            update.loss.clip_low = 0.01
+            update.loss.clip_epsilon = 0.01
             update.optimizer.param_groups[0]["lr"] = 1e-2
         return out
 
