@@ -55,7 +55,9 @@ def train(update, collector, normalizer, rollouts=4):
     return metrics
 
 
-@pytest.mark.parametrize("block", BLOCKS)
+@pytest.mark.parametrize(
+    "block", [b if b in ("crossq", "redq") else pytest.param(b, marks=pytest.mark.slow) for b in BLOCKS]
+)  # a compilation each: two of them in every run, the others with -m slow
 def test_eager_equals_compiled(block):
     results = []
     for compile in ("off", "on"):
