@@ -102,15 +102,28 @@ class _Memory:
         self.envs.memory = self.next_states[-1].copy()
 
 
+def _unchecked(entries: dict[Any, Any]) -> TensorDictBase:
+    """A TensorDict of tensors ``[N, T, ...]``; checking each entry costs a tenth of a millisecond a rollout."""
+    shape = next(iter(entries.values())).shape[:2]
+    return TensorDict._new_unsafe(source=entries, batch_size=shape)  # type: ignore[no-any-return]
+
+
 def as_rollout(arrays: Arrays, split: Callable[[Tensor], dict[str, Tensor]] = whole) -> TensorDictBase:
     """The arrays ``[T, N, ...]`` as a TensorDict ``[N, T]``, without a copy, and ``("next", "done")``."""
-    tensors: dict[Any, Tensor] = {key: torch.from_numpy(array).transpose(0, 1) for key, array in arrays.items()}
-    now, after = split(tensors.pop("observation")), split(tensors.pop(("next", "observation")))
-    tensors = {**now, **tensors, **{("next", name): x for name, x in after.items()}}
+    now: dict[Any, Any] = {}
+    after: dict[Any, Any] = {}
+    deeper: dict[Any, Any] = {}
+    for key, array in arrays.items():
+        entries, name = (
+            (now, key) if isinstance(key, str) else (after, key[-1]) if key[:-1] == ("next",) else (deeper, key)
+        )
+        entries[name] = torch.from_numpy(array).transpose(0, 1)
+    now = split(now.pop("observation")) | now
+    after = split(after.pop("observation")) | after
     if "action_mask" in now and not now["action_mask"].any(-1).all():
         raise UserError("the environment's action_mask allows no action in some state: it must allow at least one")
-    tensors["next", "done"] = tensors["next", "terminated"] | tensors["next", "truncated"]
-    rollout = TensorDict({}, batch_size=tensors["next", "done"].shape[:2])
-    for key, tensor in tensors.items():
+    after["done"] = after["terminated"] | after["truncated"]
+    rollout = _unchecked({**now, "next": _unchecked(after)})
+    for key, tensor in deeper.items():
         rollout.set(key, tensor)
     return rollout

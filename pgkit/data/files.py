@@ -26,8 +26,8 @@ def state(buffer: ReplayBuffer) -> dict[str, Any]:
         "owner": buffer.owner[:finals].clone(),
         "generator": buffer.generator.get_state(),
         "frames": {key: x[:frames].clone() for key, x in buffer.frames.items()},
-        "observations": {key: x[:frames].clone() for key, x in buffer.observations.items(True, True)},
-        "finals": {key: x[buffer.rows :][:finals].clone() for key, x in buffer.observations.items(True, True)},
+        "observations": {key: x[:frames].clone() for key, x in buffer.observations.items()},
+        "finals": {key: x[buffer.rows :][:finals].clone() for key, x in buffer.observations.items()},
         "sampler": None if buffer.sampler is None else buffer.sampler.state_dict(),
     }
 
@@ -70,7 +70,7 @@ def load(buffer: ReplayBuffer, path: Path) -> None:
 
 
 def _made_for(buffer: ReplayBuffer) -> dict[str, Any]:
-    shapes = {str(key): tuple(x.shape[1:]) for key, x in buffer.observations.items(True, True)}
+    shapes = {str(key): tuple(x.shape[1:]) for key, x in buffer.observations.items()}
     return {
         "environment": buffer.env_name,
         "observation": shapes,

@@ -73,9 +73,10 @@ class ReplayBuffer:
             "next_row": torch.zeros((), dtype=torch.int32 if self.rows + self.final_rows < 2**31 else torch.int64),
         }
         observation = {key: spec[key].zero() for key in self.observation_keys}
-        self.frames = _allocate(storage, frame, self.rows)
-        self.observations = _allocate(storage, observation, self.rows + self.final_rows)
-        tables: dict[str, Any] = {"frames": self.frames, "observations": self.observations}
+        frames = _allocate(storage, frame, self.rows)
+        observations = _allocate(storage, observation, self.rows + self.final_rows)
+        self.frames, self.observations = dict(frames.items()), dict(observations.items(True, True))
+        tables: dict[str, Any] = {"frames": frames, "observations": observations}
         if sampler is not None:
             tables["weighting"] = sampler.begin(self.rows)
         self.data = TensorDict(tables)
@@ -99,19 +100,21 @@ class ReplayBuffer:
                 f"the replay buffer was made for {self.columns} environments, the rollout's batch size is "
                 f"{tuple(rollout.batch_size)}: it must be [{self.columns}, T]"
             )
-        steps = rollout.batch_size.numel() // self.columns
-        most = self.rows // self.columns - 1
+        columns, dims, after = self.columns, rollout.batch_dims, rollout.get("next")
+        steps = rollout.batch_size.numel() // columns
+        most = self.rows // columns - 1
 
-        def rows_of(key: Any) -> Tensor:  # [T * columns, ...], in time order
-            x = rollout.get(key)
-            x = x.reshape(self.columns, steps, *x.shape[rollout.batch_dims :]).transpose(0, 1)
+        def rows_of(data: TensorDictBase, key: Any) -> Tensor:  # [T * columns, ...], in time order
+            x = data.get(key)
+            if steps == 1:
+                return x.reshape(columns, *x.shape[dims:])
+            x = x.reshape(columns, steps, *x.shape[dims:]).transpose(0, 1)
             return x[-most:].reshape(-1, *x.shape[2:])
 
-        obs = {key: rows_of(key) for key in self.observation_keys}
-        after = {key: rows_of(("next", *((key,) if isinstance(key, str) else key))) for key in self.observation_keys}
-        done = rows_of(("next", "done"))
-        columns, count = self.columns, len(done)
-        first, oldest, ready = self.written, self.start, self.start + len(self)
+        obs = {key: rows_of(rollout, key) for key in self.observation_keys}
+        next_obs = {key: rows_of(after, key) for key in self.observation_keys}
+        done = rows_of(after, "done")
+        first, count, oldest, ready = self.written, done.shape[0], self.start, self.start + len(self)
         if first > self.start:
             self._keep_ends(first, {key: x[:columns] for key, x in obs.items()})
         rows = torch.arange(first, first + count + columns) % self.rows
@@ -119,23 +122,24 @@ class ReplayBuffer:
         self.start = max(self.start, self.written - (self.rows - columns))
 
         for key, x in obs.items():
-            self._write(self.observations.get(key), first, x)
-            self._write(self.observations.get(key), first + count, after[key][count - columns :])
+            _write(self.observations[key], self.rows, first, x)
+            _write(self.observations[key], self.rows, first + count, next_obs[key][count - columns :])
         for key, x in {
-            "action": rows_of("action"),
-            "reward": rows_of(("next", "reward")),
-            "terminated": rows_of(("next", "terminated")),
+            "action": rows_of(rollout, "action"),
+            "reward": rows_of(after, "reward"),
+            "terminated": rows_of(after, "terminated"),
             "done": done,
             "next_row": rows[columns:],
         }.items():
-            self._write(self.frames.get(key), first, x)
+            _write(self.frames[key], self.rows, first, x)
 
-        ends = done.squeeze(-1).clone()
-        for key, x in obs.items():
-            ends[:-columns] |= (after[key][:-columns] != x[columns:]).flatten(1).any(-1)
+        ends = done.squeeze(-1)
+        for key, x in obs.items() if steps > 1 else ():
+            broken = (next_obs[key][:-columns] != x[columns:]).flatten(1).any(-1)
+            ends = torch.cat([ends[:-columns] | broken, ends[-columns:]])
         if ends.any():
             where = ends.nonzero().squeeze(-1)
-            self._keep_finals(first + where, {key: x[where] for key, x in after.items()})
+            self._keep_finals(first + where, {key: x[where] for key, x in next_obs.items()})
         if self.sampler is not None:
             new = torch.arange(max(ready, self.start), self.start + len(self))
             self.sampler.extend(new % self.rows, torch.arange(oldest, self.start) % self.rows)
@@ -190,21 +194,16 @@ class ReplayBuffer:
         """Reads what :meth:`save` wrote."""
         files.load(self, Path(path))
 
-    def _write(self, table: Tensor, frame: int, x: Tensor) -> None:
-        row = frame % self.rows
-        room = self.rows - row
-        table[row : min(row + len(x), self.rows)] = x[:room]
-        if len(x) > room:
-            table[: len(x) - room] = x[room:]
-
     def _keep_ends(self, frame: int, obs: dict[Any, Tensor]) -> None:
         """Of the newest step so far: keeps the next observations that ``obs``, about to overwrite them, is not."""
         head, last = frame % self.rows, (frame - self.columns) % self.rows
-        stored = {key: self.observations.get(key)[head : head + self.columns] for key in obs}
+        stored = {key: self.observations[key][head : head + self.columns] for key in obs}
+        if all(torch.equal(stored[key], x) for key, x in obs.items()):
+            return
         ends = torch.zeros(self.columns, dtype=torch.bool)
         for key, x in obs.items():
             ends |= (stored[key] != x).flatten(1).any(-1)
-        ends &= self.frames.get("next_row")[last : last + self.columns] < self.rows
+        ends &= self.frames["next_row"][last : last + self.columns] < self.rows
         if ends.any():
             where = ends.nonzero().squeeze(-1)
             self._keep_finals(frame - self.columns + where, {key: x[where] for key, x in stored.items()})
@@ -215,11 +214,18 @@ class ReplayBuffer:
             self.start = max(self.start, int(self.owner[slots].max()) + 1)
             self.owner[slots] = frames[part]
             self.finals += len(part)
-            self.frames.get("next_row")[frames[part] % self.rows] = (self.rows + slots).to(
-                self.frames["next_row"].dtype
-            )
+            self.frames["next_row"][frames[part] % self.rows] = (self.rows + slots).to(self.frames["next_row"].dtype)
             for key, x in obs.items():
-                self.observations.get(key)[self.rows + slots] = x[part]
+                self.observations[key][self.rows + slots] = x[part]
+
+
+def _write(table: Tensor, rows: int, frame: int, x: Tensor) -> None:
+    """Writes ``x`` into the ``rows`` first rows of a table, from row ``frame % rows`` on and around its end."""
+    row, count = frame % rows, x.shape[0]
+    room = min(rows - row, count)
+    table.narrow(0, row, room).copy_(x if room == count else x[:room])
+    if count > room:
+        table.narrow(0, 0, count - room).copy_(x[room:])
 
 
 def _allocate(storage: Callable[[int], TensorStorage], example: dict[Any, Tensor], rows: int) -> TensorDictBase:

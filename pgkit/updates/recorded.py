@@ -51,7 +51,7 @@ def recorded(step: Step, held: Sequence[Tensor], data: TensorDictBase, index: Te
                 for tensor, value in zip(held, before, strict=True):
                     tensor.copy_(value)
 
-    graph = undone(lambda: record(flat, [*held, *(data[key] for key in keys), index]))
+    graph = undone(lambda: record(flat, [*held, *(data[key] for key in keys), index], fusable=True))
     memory = {tensor.untyped_storage().data_ptr() for tensor in held}
     for node in graph.graph.find_nodes(op="get_attr"):
         constant = getattr(graph, str(node.target))
