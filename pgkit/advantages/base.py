@@ -16,6 +16,9 @@ class Advantage(TensorDictModuleBase):
     A subclass says in :meth:`estimate` what they are. In one call, the critic reads every observation, and besides only
     the true final observations of episodes and the rollout's last: elsewhere the next value is the value one step on.
 
+    Where an update compiles and makes few steps a rollout, a ``recordable`` estimator is recorded as tensor operations:
+    its settings that change must be buffers, as ``gamma`` is. Set it to False where they cannot be.
+
     Args:
         critic: value operator, reads the rollout's observation, writes ``state_value``; None: all values are zero.
         gamma: discount; this block owns it.
@@ -24,6 +27,7 @@ class Advantage(TensorDictModuleBase):
             ``value_target``, while ``advantage`` stays in the rewards' unit.
     """
 
+    recordable: bool = True
     gamma: Tensor
 
     def __init__(
@@ -65,6 +69,10 @@ class Advantage(TensorDictModuleBase):
         """Values of all observations and of all next ones, both ``[*B, T, 1]``."""
         own = rollout["next", "done"].squeeze(-1).clone()  # steps whose successor is not the next entry
         own[..., -1] = True
+        if torch.compiler.is_compiling():  # shapes may not depend on the data: the critic reads all next ones
+            both = torch.cat([rollout.select(*critic.in_keys), rollout["next"].select(*critic.in_keys)])
+            value, after = critic(both)[critic.out_keys[0]].chunk(2)
+            return value, torch.where(own.unsqueeze(-1), after, torch.cat([value[..., 1:, :], after[..., -1:, :]], -2))
         rows, dims = rollout.numel(), rollout.batch_dims
         both = {
             key: torch.cat([rollout[key].flatten(0, dims - 1), rollout["next"][key][own]]) for key in critic.in_keys

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping
-from typing import Any
+from logging import getLogger
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
@@ -15,6 +18,7 @@ from pgkit.errors import UserError
 from pgkit.updates import wiring
 from pgkit.updates.chain import Chain
 from pgkit.updates.diagram import diagram
+from pgkit.updates.recorded import Block, recorded_block
 from pgkit.updates.sequences import as_rows, check_one_memory
 from pgkit.updates.step import GradientStep
 
@@ -81,6 +85,9 @@ class OnPolicyUpdate:
         self.compile, self.frames = compile, 0
         self._generator = torch.Generator().manual_seed(int(torch.randint(2**62, ())) if seed is None else seed)
         self._step: GradientStep | None = None
+        self._keys: list[Any] | None = None
+        self._estimate: Block | None = None
+        self._estimate_seconds = 0.0
         self._batch: TensorDictBase | None = None
 
     def __call__(self, rollout: TensorDictBase) -> dict[str, float]:
@@ -122,7 +129,7 @@ class OnPolicyUpdate:
     @property
     def compile_seconds(self) -> float:
         """Seconds spent compiling so far."""
-        return 0.0 if self._step is None else self._step.compile_seconds
+        return self._estimate_seconds + (0.0 if self._step is None else self._step.compile_seconds)
 
     def state_dict(self) -> dict[str, Any]:
         """Networks, coefficients, optimizer, statistics of the advantage block, minibatch order and frame count."""
@@ -147,8 +154,26 @@ class OnPolicyUpdate:
     def _flatten(self, rollout: TensorDictBase) -> TensorDictBase:
         """The advantage, then the entries that the loss reads as ``[rows, ...]``."""
         if self.advantage is not None:
-            self.advantage(rollout)
-        return as_rows(rollout.select(*wiring.read_keys(self.loss, rollout)), self.sequence_length)
+            self._estimate = self._estimate or self._prepare(self.advantage, rollout)
+            self._estimate(rollout)
+        if self._keys is None or self._step is None:
+            self._keys = wiring.read_keys(self.loss, rollout)
+        return as_rows(rollout.select(*self._keys), self.sequence_length)
+
+    def _prepare(self, advantage: Block, rollout: TensorDictBase) -> Block:
+        """The advantage block, compiled where it is a good part of the update: a few steps a rollout."""
+        few = self.epochs * rollout.numel() <= 4 * (self.minibatch_size or rollout.numel())
+        rollouts = None if self.total_frames is None else self.total_frames / rollout.numel()
+        if not (few and getattr(advantage, "recordable", False) and worth_compiling(self.compile, rollouts, 5_000)):
+            return advantage
+        start = time.perf_counter()
+        try:
+            return recorded_block(cast(TensorDictModuleBase, advantage), rollout)
+        except RuntimeError as error:
+            getLogger("pgkit").debug("the advantage block cannot be recorded: %s", error)
+            return advantage
+        finally:
+            self._estimate_seconds += time.perf_counter() - start
 
     def _assemble(self, flat: TensorDictBase, size: int, rows: int) -> GradientStep:
         self._batch = flat[:size]

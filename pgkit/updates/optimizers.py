@@ -137,14 +137,14 @@ def _sgd(optimizer: Optimizer, group: dict[str, Any], lr: Tensor, fused: bool) -
     names = ["momentum_buffer"] if group["momentum"] else []
     buffers = _state(optimizer, group, *names)
 
-    def apply(grads: list[Tensor]) -> None:
+    def step(params: list[Tensor], grads: list[Tensor], lr: Any, weight_decay: float, maximize: bool) -> None:
         sgd(
-            group["params"], grads, buffers[0] if buffers else [None] * len(grads),
-            foreach=False, fused=False, weight_decay=group["weight_decay"], momentum=group["momentum"], lr=lr,
-            dampening=group["dampening"], nesterov=group["nesterov"], maximize=group["maximize"],
+            params, grads, buffers[0] if buffers else [None] * len(grads),
+            foreach=False, fused=False, weight_decay=weight_decay, momentum=group["momentum"], lr=lr,
+            dampening=group["dampening"], nesterov=group["nesterov"], maximize=maximize,
         )  # fmt: skip
 
-    return apply
+    return _at_a_tensor_s_rate(step, group, lr)
 
 
 def _rmsprop(optimizer: Optimizer, group: dict[str, Any], lr: Tensor, fused: bool) -> Apply:
@@ -153,12 +153,30 @@ def _rmsprop(optimizer: Optimizer, group: dict[str, Any], lr: Tensor, fused: boo
     names += ["grad_avg"] if group["centered"] else []
     state = dict(zip(names, _state(optimizer, group, *names), strict=True))
 
-    def apply(grads: list[Tensor]) -> None:
+    def step(params: list[Tensor], grads: list[Tensor], lr: Any, weight_decay: float, maximize: bool) -> None:
         rmsprop(
-            group["params"], grads, state["square_avg"], state.get("grad_avg", []), state.get("momentum_buffer", []),
+            params, grads, state["square_avg"], state.get("grad_avg", []), state.get("momentum_buffer", []),
             state["step"], foreach=False, capturable=is_compiling(), lr=lr, alpha=group["alpha"], eps=group["eps"],
-            weight_decay=group["weight_decay"], momentum=group["momentum"], centered=group["centered"],
-            maximize=group["maximize"],
+            weight_decay=weight_decay, momentum=group["momentum"], centered=group["centered"], maximize=maximize,
         )  # fmt: skip
+
+    return _at_a_tensor_s_rate(step, group, lr)
+
+
+def _at_a_tensor_s_rate(step: Callable[..., None], group: dict[str, Any], lr: Tensor) -> Apply:
+    """``step`` for a function of torch that turns the learning rate into a number, which would end up in the graph."""
+    params, weight_decay, maximize = group["params"], group["weight_decay"], group["maximize"]
+
+    def apply(grads: list[Tensor]) -> None:
+        if not is_compiling():
+            step(params, grads, lr, weight_decay, maximize)
+            return
+        grads = [-grad if maximize else grad for grad in grads]
+        if weight_decay:
+            grads = [grad + weight_decay * p for grad, p in zip(grads, params, strict=True)]
+        moves = [torch.zeros_like(p) for p in params]
+        step(moves, grads, 1.0, 0.0, False)
+        for p, move in zip(params, moves, strict=True):
+            p.add_(lr * move)
 
     return apply

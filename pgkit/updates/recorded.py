@@ -1,4 +1,4 @@
-"""A step recorded as tensor operations and compiled without dynamo, whose own cost is that of a small step."""
+"""Steps and blocks recorded as tensor operations and compiled without dynamo, whose own cost is that of a small step."""
 
 from __future__ import annotations
 
@@ -6,11 +6,13 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from pgkit.compiling import compile_record, record
 
+Block = Callable[[TensorDictBase], TensorDictBase]
 Step = Callable[[TensorDictBase, Tensor], tuple[Tensor, list[Tensor]]]
 
 
@@ -74,4 +76,46 @@ def recorded(step: Step, held: Sequence[Tensor], data: TensorDictBase, index: Te
     expected, got = (undone(lambda f=f: f(data, other)[0]) for f in (step, run))
     if not torch.allclose(got, expected, rtol=1e-3, atol=1e-4, equal_nan=True):
         raise RuntimeError(f"the recorded step does not repeat the step on other rows: {got} is not {expected}")
+    return run
+
+
+def recorded_block(block: TensorDictModuleBase, data: TensorDictBase) -> Block:
+    """``block(data)``, which writes its ``out_keys`` from its ``in_keys``, as one compiled graph.
+
+    Data of other shapes or strides than these goes through the block itself.
+
+    Raises:
+        RuntimeError: the block decides something on a tensor's value, changes a buffer, or is too long to compile soon.
+    """
+    buffers = list(block.buffers())
+    versions = [x._version for x in buffers]
+
+    def flat(*leaves: Tensor) -> list[Tensor]:
+        rows = TensorDict({}, batch_size=data.batch_size)
+        for key, leaf in zip(block.in_keys, leaves, strict=True):
+            rows.set(key, leaf)
+        out = block(rows)
+        return [out.get(key) for key in block.out_keys]
+
+    def inputs(data: TensorDictBase) -> list[Tensor]:
+        return [data.get(key) for key in block.in_keys]
+
+    leaves = inputs(data)
+    graph = record(flat, leaves, fusable=True)
+    if len(graph.graph.nodes) > 1_000 or versions != [x._version for x in buffers]:
+        raise RuntimeError(
+            f"tracing: {type(block).__name__} changes a buffer, or is {len(graph.graph.nodes)} operations"
+        )
+    code = compile_record(graph, leaves)
+    layout = [(x.shape, x.stride()) for x in leaves]
+
+    def run(data: TensorDictBase) -> TensorDictBase:
+        leaves = inputs(data)
+        if [(x.shape, x.stride()) for x in leaves] != layout:
+            return block(data)
+        with torch.no_grad():
+            for key, x in zip(block.out_keys, code(*leaves), strict=True):
+                data.set(key, x)
+        return data
+
     return run

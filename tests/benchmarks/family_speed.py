@@ -2,7 +2,8 @@
 
     python tests/benchmarks/family_speed.py --algorithm a2c
 
-Same env, nets and updates for both sides; the settings stand in the code. `--algorithm trpo`, `td3` or `tqc` likewise.
+Same env, nets and updates for both sides; the settings stand in the code. `--algorithm trpo`, `td3` or `tqc` likewise;
+`a2c_cartpole` is A2C on CartPole-v1. A2C runs in one process, and with two workers that collect beside the update.
 """
 
 from collections.abc import Iterator
@@ -16,7 +17,13 @@ import tyro
 
 ENV_ID = "HalfCheetah-v5"
 RANDOM_FRAMES, CHUNK, BUFFER = 1000, 500, 1_000_000
-SIZES = {"a2c": (100_000, 10_000), "trpo": (40_960, 6_144), "td3": (2_000, 2_000), "tqc": (2_000, 2_000)}
+SIZES = {
+    "a2c": (100_000, 10_000),
+    "a2c_cartpole": (100_000, 10_000),
+    "trpo": (40_960, 6_144),
+    "td3": (2_000, 2_000),
+    "tqc": (2_000, 2_000),
+}
 
 
 @dataclass
@@ -27,19 +34,21 @@ class Options(contest.Options):
     """Frames each contender trains while the clock runs; 0: as suits the algorithm."""
     warmup: int = 0
     """Frames trained before the clock starts; 0: as suits the algorithm."""
-    algorithm: Literal["a2c", "trpo", "td3", "tqc"] = "a2c"
+    algorithm: Literal["a2c", "a2c_cartpole", "trpo", "td3", "tqc"] = "a2c"
     """Which one."""
 
 
-def on_policy(seed: int, algorithm: str) -> Iterator[int]:
+def on_policy(seed: int, algorithm: str, workers: int = 1) -> Iterator[int]:
     """pgkit's A2C (8 envs x 8 steps, RMSprop) or TRPO (8 envs x 256 steps, 10 critic epochs of minibatches of 128)."""
     from pgkit import advantages, collectors, envs, losses, modules, updates
 
     torch.manual_seed(seed)
-    env = envs.make(ENV_ID, num_envs=8, seed=seed)
-    actor, critic = modules.gaussian_actor(env, (64, 64)), modules.state_value(env, (64, 64))
+    cartpole = algorithm == "a2c_cartpole"
+    env = envs.make("CartPole-v1" if cartpole else ENV_ID, num_envs=8, seed=seed, workers=workers)
+    make_actor: Any = modules.categorical_actor if cartpole else modules.gaussian_actor
+    actor, critic = make_actor(env, (64, 64)), modules.state_value(env, (64, 64))
     parameters: Any = [*actor.parameters(), *critic.parameters()]
-    if algorithm == "a2c":
+    if algorithm != "trpo":
         update: Any = updates.OnPolicyUpdate(
             loss=losses.A2CLoss(actor, critic, critic_coeff=0.5),
             advantage=advantages.GAE(critic, gamma=0.99, lmbda=1.0),
@@ -58,8 +67,9 @@ def on_policy(seed: int, algorithm: str) -> Iterator[int]:
             minibatch_size=128,
             compile="on",
         )
-    steps = 8 if algorithm == "a2c" else 256
-    for rollout in (collector := collectors.VectorCollector(env, actor, frames_per_batch=8 * steps)):
+    make_collector = collectors.AsyncCollector if workers > 1 else collectors.VectorCollector
+    collector: Any = make_collector(env, actor, frames_per_batch=8 * (256 if algorithm == "trpo" else 8))
+    for rollout in collector:
         update(rollout)
         yield collector.frames
 
@@ -100,13 +110,15 @@ def peer(seed: int, algorithm: str) -> Iterator[int]:
     replay |= {"train_freq": 1, "gradient_steps": 1}
     kinds: dict[str, tuple[Any, int, dict[str, Any]]] = {
         "a2c": (stable_baselines3.A2C, 8, {"n_steps": 8}),
+        "a2c_cartpole": (stable_baselines3.A2C, 8, {"n_steps": 8}),
         "trpo": (sb3_contrib.TRPO, 8, {"n_steps": 256, "batch_size": 128, "n_critic_updates": 10}),
         "td3": (stable_baselines3.TD3, 1, {**replay, "policy_kwargs": {"net_arch": [256, 256]}}),
         "tqc": (sb3_contrib.TQC, 1, {**replay, "policy_kwargs": {"net_arch": [256, 256], "n_critics": 2}}),
     }
     kind, num_envs, settings = kinds[algorithm]
-    model = kind("MlpPolicy", make_vec_env(ENV_ID, num_envs, seed=seed), device="cpu", seed=seed, **settings)
-    chunk = {"a2c": 6_400, "trpo": 2_048}.get(algorithm, CHUNK)
+    env_id = "CartPole-v1" if algorithm == "a2c_cartpole" else ENV_ID
+    model = kind("MlpPolicy", make_vec_env(env_id, num_envs, seed=seed), device="cpu", seed=seed, **settings)
+    chunk = {"a2c": 6_400, "a2c_cartpole": 6_400, "trpo": 2_048}.get(algorithm, CHUNK)
     while True:
         model.learn(chunk, log_interval=10**9, reset_num_timesteps=False)
         yield model.num_timesteps
@@ -114,17 +126,20 @@ def peer(seed: int, algorithm: str) -> Iterator[int]:
 
 CONTENDERS = {
     f"{name}-{side}": contest.Contender(partial(start, algorithm=name), needs, note)
-    for name, ours in {"a2c": on_policy, "trpo": on_policy, "td3": off_policy, "tqc": off_policy}.items()
+    for name, ours in {
+        "a2c": on_policy, "a2c_cartpole": on_policy, "trpo": on_policy, "td3": off_policy, "tqc": off_policy
+    }.items()
     for side, start, needs, note in (
         ("pgkit", ours, "pgkit", "compiled, one process"),
+        *([("workers", partial(on_policy, workers=2), "pgkit", "compiled, 2 workers")] if "a2c" in name else []),
         ("peer", peer, "sb3_contrib", "sb3-contrib" if name in ("trpo", "tqc") else "Stable-Baselines3"),
     )
-}
+}  # fmt: skip
 
 if __name__ == "__main__":
     options = tyro.cli(Options, description=__doc__)
     name = options.algorithm
     options.frames, options.warmup = options.frames or SIZES[name][0], options.warmup or SIZES[name][1]
-    options.contenders = options.contenders or (f"{name}-pgkit", f"{name}-peer")
-    result = contest.run(f"{name.upper()}, {ENV_ID}", options, CONTENDERS, f"{name}-pgkit")
+    options.contenders = options.contenders or tuple(key for key in CONTENDERS if key.split("-")[0] == name)
+    result = contest.run(name.upper(), options, CONTENDERS, f"{name}-pgkit")
     contest.write(options.json, result)
