@@ -55,8 +55,8 @@ class Args(run.RunArgs):
     """Threads that PyTorch uses in this process; 2 is faster than 1 for networks 256 wide."""
     action_repeat: int = 1
     """Simulator steps for each action."""
-    steps: int = 1
-    """Steps each env takes between updates."""
+    steps: int = 16
+    """Steps each env takes before as many updates; 1 is the papers' schedule, a tenth slower."""
     asynchronous: bool = False
     """Collect in another process while this one updates: rollouts are one update old, see train/policy_lag."""
     random_frames: int = 1_000
@@ -112,8 +112,8 @@ PRESETS = {
 }
 
 VARIANTS = {
-    "redq": dict(num_critics=10, subset=2, actor_value="mean", updates_per_step=20.0, actor_delay=20),
-    "droq": dict(critic="droq", actor_value="mean", updates_per_step=20.0, actor_delay=20),
+    "redq": dict(num_critics=10, subset=2, actor_value="mean", steps=1, updates_per_step=20.0, actor_delay=20),
+    "droq": dict(critic="droq", actor_value="mean", steps=1, updates_per_step=20.0, actor_delay=20),
     "tqc": dict(value_head="quantile", num_critics=5, actor_value="mean"),
     "crossq": dict(
         critic="crossq", actor_delay=3, beta1=0.5, learning_rate=1e-3, q_learning_rate=1e-3, alpha_learning_rate=1e-3

@@ -30,8 +30,8 @@ class Args(run.RunArgs):
     """Threads that PyTorch uses in this process; 2 is faster than 1 for networks 256 wide."""
     action_repeat: int = 1
     """Simulator steps for each action."""
-    steps: int = 1
-    """Steps each env takes between updates."""
+    steps: int = 16
+    """Steps each env takes before as many updates; 1 is the papers' schedule, a tenth slower."""
     asynchronous: bool = False
     """Collect in another process while this one updates: rollouts are one update old, see train/policy_lag."""
     random_frames: int = 10_000

@@ -1,4 +1,4 @@
-"""Steps and blocks recorded as tensor operations and compiled without dynamo, whose own cost is that of a small step."""
+"""Steps and blocks recorded as tensor operations and compiled without dynamo, which costs more than a small step."""
 
 from __future__ import annotations
 

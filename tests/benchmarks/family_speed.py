@@ -39,7 +39,7 @@ class Options(contest.Options):
 
 
 def on_policy(seed: int, algorithm: str, workers: int = 1) -> Iterator[int]:
-    """pgkit's A2C (8 envs x 8 steps, RMSprop) or TRPO (8 envs x 256 steps, 10 critic epochs of minibatches of 128)."""
+    """pgkit's A2C (8 envs x 5 steps, RMSprop) or TRPO (8 envs x 256 steps, 10 critic epochs of minibatches of 128)."""
     from pgkit import advantages, collectors, envs, losses, modules, updates
 
     torch.manual_seed(seed)
@@ -68,14 +68,14 @@ def on_policy(seed: int, algorithm: str, workers: int = 1) -> Iterator[int]:
             compile="on",
         )
     make_collector = collectors.AsyncCollector if workers > 1 else collectors.VectorCollector
-    collector: Any = make_collector(env, actor, frames_per_batch=8 * (256 if algorithm == "trpo" else 8))
+    collector: Any = make_collector(env, actor, frames_per_batch=8 * (256 if algorithm == "trpo" else 5))
     for rollout in collector:
         update(rollout)
         yield collector.frames
 
 
 def off_policy(seed: int, algorithm: str) -> Iterator[int]:
-    """pgkit's TD3 or TQC: one env, one update a frame, batch 256, 2x256 ReLU."""
+    """pgkit's TD3 or TQC: one env, 16 frames and 16 updates in turn as in the recipes, batch 256, 2x256 ReLU."""
     from pgkit import collectors, data, envs, heads, losses, modules, updates
 
     torch.manual_seed(seed)
@@ -93,11 +93,10 @@ def off_policy(seed: int, algorithm: str) -> Iterator[int]:
     update = updates.OffPolicyUpdate(
         loss, buffer, optimizer, batch_size=256, learning_starts=RANDOM_FRAMES, compile="on", **settings
     )
-    collector = collectors.VectorCollector(env, policy, frames_per_batch=1, init_random_frames=RANDOM_FRAMES)
+    collector = collectors.VectorCollector(env, policy, frames_per_batch=16, init_random_frames=RANDOM_FRAMES)
     for rollout in collector:
         update(rollout)
-        if collector.frames % CHUNK == 0:
-            yield collector.frames
+        yield collector.frames
 
 
 def peer(seed: int, algorithm: str) -> Iterator[int]:
@@ -109,8 +108,8 @@ def peer(seed: int, algorithm: str) -> Iterator[int]:
     replay = {"learning_rate": 3e-4, "buffer_size": BUFFER, "learning_starts": RANDOM_FRAMES, "batch_size": 256}
     replay |= {"train_freq": 1, "gradient_steps": 1}
     kinds: dict[str, tuple[Any, int, dict[str, Any]]] = {
-        "a2c": (stable_baselines3.A2C, 8, {"n_steps": 8}),
-        "a2c_cartpole": (stable_baselines3.A2C, 8, {"n_steps": 8}),
+        "a2c": (stable_baselines3.A2C, 8, {"n_steps": 5}),
+        "a2c_cartpole": (stable_baselines3.A2C, 8, {"n_steps": 5}),
         "trpo": (sb3_contrib.TRPO, 8, {"n_steps": 256, "batch_size": 128, "n_critic_updates": 10}),
         "td3": (stable_baselines3.TD3, 1, {**replay, "policy_kwargs": {"net_arch": [256, 256]}}),
         "tqc": (sb3_contrib.TQC, 1, {**replay, "policy_kwargs": {"net_arch": [256, 256], "n_critics": 2}}),
@@ -118,7 +117,7 @@ def peer(seed: int, algorithm: str) -> Iterator[int]:
     kind, num_envs, settings = kinds[algorithm]
     env_id = "CartPole-v1" if algorithm == "a2c_cartpole" else ENV_ID
     model = kind("MlpPolicy", make_vec_env(env_id, num_envs, seed=seed), device="cpu", seed=seed, **settings)
-    chunk = {"a2c": 6_400, "a2c_cartpole": 6_400, "trpo": 2_048}.get(algorithm, CHUNK)
+    chunk = {"a2c": 4_000, "a2c_cartpole": 4_000, "trpo": 2_048}.get(algorithm, CHUNK)
     while True:
         model.learn(chunk, log_interval=10**9, reset_num_timesteps=False)
         yield model.num_timesteps

@@ -20,6 +20,7 @@ from tensordict import TensorDict
 
 ENV_ID, BATCH, WIDTH, OBSERVATION, ACTION = "HalfCheetah-v5", 256, 256, 17, 6
 RANDOM_FRAMES, CHUNK, BUFFER = 1000, 500, 1_000_000
+STEPS = 16  # frames collected before as many updates, in recipes/sac.py
 
 
 @dataclass
@@ -54,30 +55,29 @@ def frames(steps: int) -> TensorDict:
     return TensorDict({**now, "next": after}, [1, steps])
 
 
-def pgkit(seed: int, stored: int = 0) -> Iterator[int]:
-    """pgkit through its public API, one frame and one update in turn."""
+def pgkit(seed: int, steps: int = STEPS, stored: int = 0) -> Iterator[int]:
+    """pgkit through its public API, so many frames and as many updates in turn."""
     from pgkit import collectors
 
     env, actor, update = agent(seed, stored)
-    collector = collectors.VectorCollector(env, actor, frames_per_batch=1, init_random_frames=RANDOM_FRAMES)
+    collector = collectors.VectorCollector(env, actor, frames_per_batch=steps, init_random_frames=RANDOM_FRAMES)
     for rollout in collector:
         update(rollout)
-        if collector.frames % CHUNK == 0:
-            yield collector.frames
+        yield collector.frames
 
 
-def sb3(seed: int) -> Iterator[int]:
+def sb3(seed: int, steps: int = 1) -> Iterator[int]:
     """Stable-Baselines3."""
     from stable_baselines3 import SAC
 
-    yield from _baselines(SAC, seed)
+    yield from _baselines(SAC, seed, steps)
 
 
-def sbx(seed: int) -> Iterator[int]:
+def sbx(seed: int, steps: int = 1) -> Iterator[int]:
     """SBX: Stable-Baselines3's algorithms in JAX, compiled by XLA."""
     from sbx import SAC
 
-    yield from _baselines(SAC, seed)
+    yield from _baselines(SAC, seed, steps)
 
 
 def torchrl(seed: int, compiled: bool) -> Iterator[int]:
@@ -88,7 +88,7 @@ def torchrl(seed: int, compiled: bool) -> Iterator[int]:
     yield from torchrl_parts.sac(seed, env_id=ENV_ID, compiled=compiled, **sizes)
 
 
-def _baselines(algorithm: Any, seed: int) -> Iterator[int]:
+def _baselines(algorithm: Any, seed: int, steps: int) -> Iterator[int]:
     from stable_baselines3.common.env_util import make_vec_env
 
     model = algorithm(
@@ -98,8 +98,8 @@ def _baselines(algorithm: Any, seed: int) -> Iterator[int]:
         buffer_size=BUFFER,
         learning_rate=3e-4,
         learning_starts=RANDOM_FRAMES,
-        train_freq=1,
-        gradient_steps=1,
+        train_freq=steps,
+        gradient_steps=steps,
         tau=0.005,
         gamma=0.99,
         ent_coef="auto",
@@ -182,10 +182,15 @@ def replay(threads: int, prioritized: bool) -> dict[str, float]:
 
 
 CONTENDERS = {
-    "pgkit": contest.Contender(pgkit, "pgkit", "one frame, one update"),
-    "pgkit-1M": contest.Contender(partial(pgkit, stored=BUFFER), "pgkit", "as above, with a million frames stored"),
-    "sb3": contest.Contender(sb3, "stable_baselines3", "train_freq=1, gradient_steps=1"),
-    "sbx": contest.Contender(sbx, "sbx", "train_freq=1, gradient_steps=1, JAX"),
+    "pgkit": contest.Contender(pgkit, "pgkit", f"{STEPS} frames, {STEPS} updates, the recipe's default"),
+    "pgkit-1": contest.Contender(partial(pgkit, steps=1), "pgkit", "one frame, one update"),
+    "pgkit-1M": contest.Contender(partial(pgkit, stored=BUFFER), "pgkit", "as the first, a million frames stored"),
+    "sb3": contest.Contender(sb3, "stable_baselines3", "one frame, one update"),
+    f"sb3-{STEPS}": contest.Contender(
+        partial(sb3, steps=STEPS), "stable_baselines3", f"{STEPS} frames, {STEPS} updates"
+    ),
+    "sbx": contest.Contender(sbx, "sbx", "one frame, one update, JAX"),
+    f"sbx-{STEPS}": contest.Contender(partial(sbx, steps=STEPS), "sbx", f"{STEPS} frames, {STEPS} updates, JAX"),
     "torchrl": contest.Contender(
         partial(torchrl, compiled=False), "torchrl", f"{CHUNK} frames, {CHUNK} updates; eager"
     ),
