@@ -36,7 +36,7 @@ def test_resumed_without_its_buffer_it_says_so_and_goes_on(tmp_path):
     train(tmp_path / "run", frames=300)
     done = pgkit("run", "sac", "--resume", tmp_path / "run", "--total-frames", 600)
     assert "resumed without the replay buffer" in done.stdout + done.stderr
-    assert int(rows(tmp_path / "run")[-1]["frames"]) == 600
+    assert int(rows(tmp_path / "run")[-1]["frames"]) >= 600
 
 
 @pytest.mark.parametrize(
