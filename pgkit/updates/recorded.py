@@ -102,7 +102,7 @@ def recorded_block(block: TensorDictModuleBase, data: TensorDictBase) -> Block:
 
     leaves = inputs(data)
     graph = record(flat, leaves, fusable=True)
-    if len(graph.graph.nodes) > 1_000 or versions != [x._version for x in buffers]:
+    if len(graph.graph.nodes) > 300 or versions != [x._version for x in buffers]:
         raise RuntimeError(
             f"tracing: {type(block).__name__} changes a buffer, or is {len(graph.graph.nodes)} operations"
         )

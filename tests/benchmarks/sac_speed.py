@@ -155,25 +155,27 @@ def floor(threads: int) -> tuple[float, float]:
 
 
 def replay(threads: int, prioritized: bool) -> dict[str, float]:
-    """Milliseconds of one frame's replay and update: the write, the draw, the step with its gather and without."""
+    """Milliseconds a frame of replay and update: the write, the draw, the step with its gather and without."""
     from pgkit import data, updates
 
     torch.set_num_threads(threads)
     _, _, update = agent(0, 20_000, data.Prioritized() if prioritized else None)
-    frame, buffer = frames(1), update.buffer
+    rollout, buffer = frames(STEPS), update.buffer
     update.train(1)
     whole = update._steps[True]
     index = buffer.sample_index(BATCH)[0]
     batch = update._batches.gather(buffer.data, index)
     loss, optimizer = update.loss, update.optimizer
     bare = updates.GradientStep(
-        loss, optimizer, whole.names[:-1], after=update._average, gather=lambda data, _: data.copy(), compile=True
-    )
+        loss, optimizer, whole.names[:-1], after=update._average, gather=lambda data, _: data.copy(), compile=True,
+        record=update._batches.record,
+    )  # fmt: skip
     bare(batch, index)
     times: dict[str, list[float]] = {"write": [], "draw": [], "step": [], "step without gather": []}
     for _ in range(10):
-        times["write"].append(contest.milliseconds(lambda: buffer.extend(frame), calls=100))
-        times["draw"].append(contest.milliseconds(lambda: buffer.sample_index(BATCH), calls=100))
+        times["write"].append(contest.milliseconds(lambda: buffer.extend(rollout), calls=100) / STEPS)
+        draws = 1 if prioritized else STEPS  # as the update draws them
+        times["draw"].append(contest.milliseconds(lambda: buffer.sample_index(BATCH, draws), calls=100) / draws)
         times["step"].append(contest.milliseconds(lambda: whole(buffer.data, index), calls=100))
         times["step without gather"].append(contest.milliseconds(lambda: bare(batch, index), calls=100))
     result = {name: median(values) for name, values in times.items()}
