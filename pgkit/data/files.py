@@ -45,11 +45,11 @@ def restore(buffer: ReplayBuffer, saved: dict[str, Any]) -> None:
     buffer.owner[: len(saved["owner"])] = saved["owner"]
     buffer.generator.set_state(saved["generator"])
     for key, x in saved["frames"].items():
-        buffer.frames.get(key)[: len(x)] = x
+        buffer.frames[key][: len(x)] = x
     for key, x in saved["observations"].items():
-        buffer.observations.get(key)[: len(x)] = x
+        buffer.observations[key][: len(x)] = x
     for key, x in saved["finals"].items():
-        buffer.observations.get(key)[buffer.rows : buffer.rows + len(x)] = x
+        buffer.observations[key][buffer.rows : buffer.rows + len(x)] = x
     if buffer.sampler is not None:
         buffer.sampler.load_state_dict(saved["sampler"])
 
@@ -74,7 +74,7 @@ def _made_for(buffer: ReplayBuffer) -> dict[str, Any]:
     return {
         "environment": buffer.env_name,
         "observation": shapes,
-        "action": tuple(buffer.frames.get("action").shape[1:]),
+        "action": tuple(buffer.frames["action"].shape[1:]),
         "num_envs": buffer.columns,
         "capacity": buffer.capacity,
         "final_rows": buffer.final_rows,

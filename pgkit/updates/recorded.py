@@ -87,8 +87,7 @@ def recorded_block(block: TensorDictModuleBase, data: TensorDictBase) -> Block:
     Raises:
         RuntimeError: the block decides something on a tensor's value, changes a buffer, or is too long to compile soon.
     """
-    buffers = list(block.buffers())
-    versions = [x._version for x in buffers]
+    buffers = [(x, x._version, x.clone()) for x in block.buffers()]
 
     def flat(*leaves: Tensor) -> list[Tensor]:
         rows = TensorDict({}, batch_size=data.batch_size)
@@ -102,10 +101,12 @@ def recorded_block(block: TensorDictModuleBase, data: TensorDictBase) -> Block:
 
     leaves = inputs(data)
     graph = record(flat, leaves, fusable=True)
-    if len(graph.graph.nodes) > 300 or versions != [x._version for x in buffers]:
-        raise RuntimeError(
-            f"tracing: {type(block).__name__} changes a buffer, or is {len(graph.graph.nodes)} operations"
-        )
+    changed = [(x, value) for x, version, value in buffers if x._version != version]
+    for x, value in changed:
+        x.copy_(value)
+    if changed or len(graph.graph.nodes) > 300:
+        what = "changes a buffer" if changed else f"is {len(graph.graph.nodes)} operations, too many to compile soon"
+        raise RuntimeError(f"tracing: {type(block).__name__} {what}")
     code = compile_record(graph, leaves)
     layout = [(x.shape, x.stride()) for x in leaves]
 

@@ -172,9 +172,9 @@ def replay(threads: int, prioritized: bool) -> dict[str, float]:
     )  # fmt: skip
     bare(batch, index)
     times: dict[str, list[float]] = {"write": [], "draw": [], "step": [], "step without gather": []}
+    draws = 1 if prioritized else STEPS  # as the update draws them
     for _ in range(10):
         times["write"].append(contest.milliseconds(lambda: buffer.extend(rollout), calls=100) / STEPS)
-        draws = 1 if prioritized else STEPS  # as the update draws them
         times["draw"].append(contest.milliseconds(lambda: buffer.sample_index(BATCH, draws), calls=100) / draws)
         times["step"].append(contest.milliseconds(lambda: whole(buffer.data, index), calls=100))
         times["step without gather"].append(contest.milliseconds(lambda: bare(batch, index), calls=100))

@@ -1,3 +1,4 @@
+from functools import partial
 from typing import Any
 
 import pytest
@@ -8,6 +9,7 @@ from torchrl.objectives.value import GAE as TorchRLGAE
 
 from pgkit import advantages, controllers, envs, losses, modules, updates
 from pgkit.errors import UserError
+from pgkit.updates.recorded import recorded_block
 
 
 def make_agent(seed=0, dtype=torch.float32, loss_class=losses.ClipPPOLoss, optimizer=torch.optim.Adam, **kwargs):
@@ -48,13 +50,50 @@ def test_compiling_leaves_no_trace():
         assert a["step"] == b["step"] == 1
 
 
-@pytest.mark.parametrize("optimizer", [torch.optim.SGD, torch.optim.RMSprop, torch.optim.AdamW, torch.optim.Adagrad])
+@pytest.mark.parametrize(
+    "optimizer",
+    [
+        partial(torch.optim.SGD, momentum=0.9, nesterov=True, weight_decay=0.1),
+        partial(torch.optim.RMSprop, momentum=0.9, centered=True, weight_decay=0.1, maximize=True),
+        torch.optim.AdamW,
+        torch.optim.Adagrad,
+    ],
+)
 def test_every_optimizer_compiles(optimizer):
     a, b = (make_agent(compile=mode, optimizer=optimizer, epochs=1) for mode in ("on", "off"))
     for i in range(3):
-        a(make_rollout(i))
-        b(make_rollout(i))
+        for update in (a, b):
+            update.optimizer.param_groups[0]["lr"] = 1e-3 * (i + 1)
+            update(make_rollout(i))
     torch.testing.assert_close(parameters(a), parameters(b), rtol=1e-4, atol=1e-5)
+
+
+def test_a_recorded_advantage_follows_weights_and_settings_and_leaves_other_layouts_to_the_block():
+    update = make_agent(compile="on", epochs=1, minibatch_size=None)
+    update(make_rollout())
+    block: Any = update.advantage
+    assert update._estimate is not None and update._estimate is not block
+    other = make_rollout(3, rows=(64, 2)).transpose(0, 1)  # the same shape, other strides
+    for rollout in (make_rollout(1), make_rollout(2), other):
+        with torch.no_grad():
+            for parameter in block.critic.parameters():
+                parameter.add_(0.1)
+        block.gamma.mul_(0.9)
+        expected, got = block(rollout.clone()), update._estimate(rollout.clone(recurse=False))
+        for key in block.out_keys:
+            torch.testing.assert_close(got[key], expected[key])
+
+
+def test_an_advantage_that_changes_its_buffers_is_not_recorded():
+    class Counting(advantages.GAE):
+        def estimate(self, value, next_value, rollout):
+            self.gamma.mul_(0.9)
+            return super().estimate(value, next_value, rollout)
+
+    block = Counting(modules.state_value(envs.make("Pendulum-v1")))
+    with pytest.raises(RuntimeError, match="changes a buffer"):
+        recorded_block(block, make_rollout())
+    assert block.gamma == torch.tensor(0.99)
 
 
 def test_compiled_step_follows_normalizers_coefficients_and_learning_rate():
