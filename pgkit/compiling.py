@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Sequence
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from logging import getLogger
 from typing import Any, cast
 
 import torch
 from torch import Tensor
+from torch.compiler import is_dynamo_compiling
 from torch.fx import GraphModule
 from torch.fx.experimental.proxy_tensor import make_fx
 
@@ -56,8 +59,25 @@ def record(function: Callable[..., Any], inputs: Sequence[Tensor], fusable: bool
     value raises ``RuntimeError``. Tensors that it uses without being given them are referred to. ``fusable`` takes some
     operations apart, for :func:`compile_record`; without it the graph repeats the function bit for bit.
     """
-    with torch.compiler._compile_session_context():
+    with torch.compiler._compile_session_context(), _torchrl_told_so():
         return make_fx(function, decomposition_table=_FUSABLE if fusable else {})(*inputs)
+
+
+@contextmanager
+def _torchrl_told_so() -> Iterator[None]:
+    """TorchRL's losses ask ``is_dynamo_compiling()``, a constant that dynamo alone replaces: here it says yes."""
+    asking = [
+        module
+        for name, module in list(sys.modules.items())
+        if name.startswith("torchrl.") and vars(module).get("is_dynamo_compiling") is is_dynamo_compiling
+    ]
+    for module in asking:
+        vars(module)["is_dynamo_compiling"] = lambda: True
+    try:
+        yield
+    finally:
+        for module in asking:
+            vars(module)["is_dynamo_compiling"] = is_dynamo_compiling
 
 
 def compile_record(graph: GraphModule, inputs: Sequence[Tensor]) -> Callable[..., Any]:
