@@ -151,8 +151,9 @@ class QLoss(Loss):
         """As in TorchRL: sets ``gamma``. One- and n-step targets come from the replay, so only ``TD0`` is known."""
         if value_type not in (None, ValueEstimators.TD0):
             raise NotImplementedError(f"{type(self).__name__} takes TD0; for n-step targets give the replay n_steps=")
-        if hyperparams.keys() - {"gamma"}:
-            raise TypeError(f"unknown settings of the value estimator: {', '.join(hyperparams.keys() - {'gamma'})}")
+        unknown = hyperparams.keys() - {"gamma", "device"}
+        if unknown:
+            raise TypeError(f"unknown settings of the value estimator: {', '.join(unknown)}")
         if "gamma" in hyperparams:
             self.gamma.fill_(hyperparams["gamma"])
         return self

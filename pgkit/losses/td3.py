@@ -10,7 +10,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data import TensorSpec
+from torchrl.data import Bounded, Composite, TensorSpec
 
 from pgkit.errors import UserError
 from pgkit.functional import smoothed_action
@@ -49,8 +49,8 @@ class TD3Loss(QLoss):
     ``next_state_value``, ``target_value``; and ``td_error [*B]`` into the batch, the priority of a prioritized replay.
 
     Raises:
-        UserError: the actor draws its actions from a distribution, or it is not exactly one of ``action_spec`` and
-            ``bounds`` that is given.
+        UserError: the actor draws its actions from a distribution, it is not exactly one of ``action_spec`` and
+            ``bounds`` that is given, or the spec has no bounds.
     """
 
     min_action: Tensor
@@ -83,6 +83,12 @@ class TD3Loss(QLoss):
             actor_network, qvalue_network, num_qvalue_nets=num_qvalue_nets, gamma=gamma, delay_actor=delay_actor,
             delay_qvalue=delay_qvalue, separate_losses=separate_losses, reduction=reduction, head=head,
         )  # fmt: skip
+        if isinstance(action_spec, Composite):
+            action_spec = action_spec[self.tensor_keys.action]
+        if bounds is None and not isinstance(action_spec, Bounded):
+            raise UserError(
+                f"TD3Loss clips its smoothed actions: their spec must be Bounded, this one is {action_spec}"
+            )
         space: Any = getattr(action_spec, "space", None)
         low, high = bounds or (space.low, space.high)
         numbers = {"min_action": low, "max_action": high, "policy_noise": policy_noise, "noise_clip": noise_clip}

@@ -5,6 +5,7 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
+from torchrl.data import Composite, Unbounded
 from torchrl.objectives import SoftUpdate
 from torchrl.objectives import TD3Loss as TorchRLTD3Loss
 
@@ -211,3 +212,12 @@ def test_refusals():
         losses.TD3Loss(modules.tanh_normal_actor(env), critics, action_spec=spec)
     with pytest.raises(UserError, match="action_spec= or bounds="):
         losses.TD3Loss(modules.deterministic_actor(env), critics)
+
+
+def test_a_spec_may_be_the_actor_s_composite_and_must_have_bounds():
+    env = envs.make("Pendulum-v1")
+    actor, critics = modules.deterministic_actor(env), modules.q_value(env)
+    loss = losses.TD3Loss(actor, critics, action_spec=Composite(action=env.action_spec_unbatched))
+    assert loss.max_action == 2 and loss.min_action == -2
+    with pytest.raises(UserError, match="must be Bounded"):
+        losses.TD3Loss(actor, critics, action_spec=Unbounded(1))

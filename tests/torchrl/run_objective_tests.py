@@ -25,7 +25,7 @@ import torchrl.objectives
 from pgkit import losses
 
 DROPPED: dict[str, Any] = {
-    "device": None, "deactivate_vmap": None, "functional": True, "value_network": None, "delay_value": False,
+    "device": None, "deactivate_vmap": None, "functional": None, "value_network": None, "delay_value": False,
     "skip_done_states": False,
 }  # fmt: skip
 """Keyword and the value at which it asks for nothing; None: at any value."""
