@@ -62,7 +62,7 @@ class Args(run.RunArgs):
 
 PRESETS = {
     "CartPole-*": dict(
-        total_frames=100_000, eval_every=25_000, steps=64, max_kl=0.02, gamma=0.98, lmbda=0.9,
+        total_frames=100_000, eval_every=25_000, steps=128, max_kl=0.02, gamma=0.98, lmbda=0.9,
         normalize_obs=False,
     ),
     "HalfCheetah-*": dict(lmbda=0.9),

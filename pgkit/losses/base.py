@@ -11,6 +11,11 @@ from torch import Tensor
 from torchrl.objectives import LossModule
 
 
+def listed(keys: Any) -> list[NestedKey]:
+    """The keys of a setting that may be one key, or several in a list: the parts of a composite action."""
+    return keys if isinstance(keys, list) else [keys]
+
+
 class Loss(LossModule):
     """A TorchRL ``LossModule`` whose subclass says what it reads and writes in two methods.
 
@@ -47,7 +52,7 @@ class Loss(LossModule):
     def in_keys(self) -> list[NestedKey]:
         """Every entry that ``forward`` reads."""
         if self._in_keys is None:
-            self._in_keys = list(dict.fromkeys(self._reads()))
+            self._in_keys = list(dict.fromkeys(key for keys in self._reads() for key in listed(keys)))
         return list(self._in_keys)
 
     @in_keys.setter

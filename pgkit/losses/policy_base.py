@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule
+from tensordict.nn import CompositeDistribution, TensorDictModule, set_composite_lp_aggregate
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torch.distributions import Distribution, kl_divergence
@@ -15,7 +15,7 @@ from torchrl.modules.distributions.utils import sample_and_log_prob
 from torchrl.objectives.utils import ValueEstimators, dispatch_value_estimator
 
 from pgkit.functional import approx_kl, same_shape
-from pgkit.losses.base import Loss
+from pgkit.losses.base import Loss, listed
 
 
 class PolicyLoss(Loss):
@@ -75,12 +75,16 @@ class PolicyLoss(Loss):
             return self.actor_network.get_dist(batch.select(*self.actor_network.in_keys))
 
     def log_prob(self, dist: Distribution, batch: TensorDictBase) -> Tensor:
-        """Log-probability of the batch's actions, ``[*B]``."""
+        """Log-probability of the batch's actions, ``[*B]``; of a composite action, that of all its parts."""
+        if isinstance(dist, CompositeDistribution):
+            with set_composite_lp_aggregate(True):
+                return dist.log_prob(batch)
         return dist.log_prob(batch[self.tensor_keys.action])
 
     def log_ratio(self, dist: Distribution, batch: TensorDictBase) -> Tensor:
         r""":math:`\log \pi(a|s) - \log \pi_{old}(a|s)` of the batch's actions, ``[*B, 1]``."""
-        log_prob, old_log_prob = self.log_prob(dist, batch), batch[self.tensor_keys.sample_log_prob]
+        log_prob = self.log_prob(dist, batch)
+        old_log_prob = torch.stack([batch[key] for key in listed(self.tensor_keys.sample_log_prob)]).sum(0)
         same_shape(log_prob=log_prob, old_log_prob=old_log_prob)
         return (log_prob - old_log_prob).unsqueeze(-1)
 
@@ -122,7 +126,10 @@ class PolicyLoss(Loss):
         return out.get(self.tensor_keys.value)
 
     def entropy(self, dist: Distribution) -> Tensor:
-        """Entropy ``[*B]``: closed form, or minus the mean log-probability of ``samples_mc_entropy`` draws."""
+        """Entropy ``[*B]``: in closed form, or minus the mean log-probability of ``samples_mc_entropy`` draws."""
+        if isinstance(dist, CompositeDistribution):
+            with set_composite_lp_aggregate(True):
+                return dist.entropy(self.samples_mc_entropy)
         try:
             return dist.entropy()
         except NotImplementedError:

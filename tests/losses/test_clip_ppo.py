@@ -1,6 +1,11 @@
+from functools import partial
+
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import CompositeDistribution, TensorDictModule
+from torch import nn
+from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import ClipPPOLoss as TorchRLClipPPOLoss
 from torchrl.objectives.utils import ValueEstimators
 
@@ -160,3 +165,37 @@ def test_samples_mc_entropy_averages_draws(agent):
         torch.manual_seed(0)
         deviations.append(loss.entropy(dist).std().item())
     assert deviations[0] / deviations[1] == pytest.approx(4.0, rel=0.1)
+
+
+def test_a_composite_action_is_scored_by_the_sum_of_its_parts():
+    parts = {"steer": torch.distributions.Normal, "gear": torch.distributions.Categorical}
+    names = {"steer": ("action", "steer"), "gear": ("action", "gear")}
+    net = nn.Linear(3, 5)
+
+    class Parameters(nn.Module):
+        def forward(self, observation):
+            out = net(observation)
+            return out[..., 0], out[..., 1].exp(), out[..., 2:]
+
+    keys = [("params", "steer", "loc"), ("params", "steer", "scale"), ("params", "gear", "logits")]
+    actor = ProbabilisticActor(
+        TensorDictModule(Parameters(), ["observation"], keys),
+        in_keys=["params"],
+        out_keys=list(names.values()),
+        distribution_class=partial(CompositeDistribution, distribution_map=parts, name_map=names),
+        return_log_prob=True,
+    )
+    batch = actor(TensorDict({"observation": torch.randn(8, 3)}, [8])).detach()
+    batch["advantage"] = torch.randn(8, 1)
+    log_probs = [("action", "steer_log_prob"), ("action", "gear_log_prob")]
+    loss = losses.ClipPPOLoss(actor, normalize_advantage=False, entropy_coeff=0.1)
+    loss.set_keys(action="action", sample_log_prob=log_probs)
+    assert set(log_probs) <= set(loss.in_keys)
+    for key in log_probs:
+        batch[key] = batch[key] - 0.05
+    out = loss(batch)
+    ratio = torch.tensor(0.1).exp()  # both parts' log-probabilities rose by 0.05
+    torch.testing.assert_close(out["loss_objective"], -(ratio * batch["advantage"]).mean())
+    steer = torch.distributions.Normal(batch[keys[0]], batch[keys[1]])
+    gear = torch.distributions.Categorical(logits=batch[keys[2]])
+    torch.testing.assert_close(out["entropy"], (steer.entropy() + gear.entropy()).mean())
