@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModule, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
-from pgkit.functional import adapted_coefficient, ratio_surrogate
+from pgkit.functional import adapted_coefficient, approx_kl, ratio_surrogate
 from pgkit.losses.actor_critic_base import ActorCriticLoss
 
 
@@ -41,8 +41,8 @@ class KLPENPPOLoss(ActorCriticLoss):
         entropy_coeff, critic_coeff, loss_critic_type, normalize_advantage, clip_value, entropy_bonus, separate_losses,
             reduction: as in :class:`~pgkit.losses.ActorCriticLoss`.
 
-    Writes ``loss_objective``, ``loss_critic``, ``loss_entropy`` and the metrics ``entropy``, ``kl``, ``beta``,
-    ``explained_variance``.
+    Writes ``loss_objective``, ``loss_critic``, ``loss_entropy`` and the metrics ``entropy``, ``kl``, ``kl_approx``
+    (the estimate from the batch's actions), ``beta``, ``explained_variance``.
     """
 
     _schedulable_buffers: ClassVar[frozenset[str]] = ActorCriticLoss._schedulable_buffers | {"beta"}
@@ -82,7 +82,7 @@ class KLPENPPOLoss(ActorCriticLoss):
         return [*super()._read_keys(), *self.distribution_keys]
 
     def _writes(self) -> list[NestedKey]:
-        return ["loss_objective", *super()._writes(), "kl", "beta"]
+        return ["loss_objective", *super()._writes(), "kl", "kl_approx", "beta"]
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -91,12 +91,14 @@ class KLPENPPOLoss(ActorCriticLoss):
         advantage, dist = self.get_advantage(batch), self.distribution(batch)
         kl = self.kl(batch, dist).unsqueeze(-1)
         beta = (self.beta if self.controller is None else self.controller.beta).clone()
-        objective = ratio_surrogate(self.log_ratio(dist, batch), advantage) - beta * kl
+        log_ratio = self.log_ratio(dist, batch)
+        objective = ratio_surrogate(log_ratio, advantage) - beta * kl
 
         out = TensorDict({"loss_objective": self.reduce(-objective, batch)})
         self.add_entropy(out, dist, batch)
         self.add_critic(out, batch)
         out["kl"], out["beta"] = kl.detach().mean(), beta
+        out["kl_approx"] = approx_kl(log_ratio.detach()).mean()
         if self.controller is None:
             with torch.no_grad():
                 self.beta.copy_(adapted_coefficient(beta, out["kl"], self.dtarg, self.increment, self.decrement))

@@ -78,6 +78,7 @@ class QLoss(Loss):
     ) -> None:
         super().__init__(reduction)
         self.register_coeff_buffer("gamma", gamma)
+        self.delay_actor, self.delay_qvalue = delay_actor, delay_qvalue
         self.convert_to_functional(actor_network, "actor_network", create_target_params=delay_actor)
         several = isinstance(qvalue_network, Sequence) and not isinstance(qvalue_network, torch.nn.Module)
         networks = list(qvalue_network) if several else [qvalue_network]
