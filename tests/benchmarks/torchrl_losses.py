@@ -160,7 +160,7 @@ def torchrl_loop(agent: Agent, draw: Callable[[], TensorDictBase], max_grad_norm
 
     def step() -> None:
         out = agent.loss(draw())
-        torch.stack([out[key].sum() for key in out.keys() if key.startswith("loss_")]).sum().backward()
+        torch.stack([out[key].sum() for key in out.keys() if key.startswith("loss")]).sum().backward()
         if max_grad_norm is not None:
             nn.utils.clip_grad_norm_(agent.loss.parameters(), max_grad_norm)
         optimizer.step()
