@@ -37,30 +37,14 @@ def worth_compiling(compile: str, calls: float | None, least_calls: float) -> bo
     return calls is None or calls >= least_calls
 
 
-def _biased(product: Callable[[Tensor, Tensor], Tensor]) -> Callable[..., Tensor]:
-    def call(bias: Tensor, left: Tensor, right: Tensor, *, beta: float = 1, alpha: float = 1) -> Tensor:
-        out = product(left, right)
-        return (out if alpha == 1 else alpha * out) + (bias if beta == 1 else beta * bias)
-
-    return call
-
-
-# a bias apart from its product is added in the kernel of the activation, where addmm copies it first
-_FUSABLE: dict[Any, Callable[..., Tensor]] = {
-    torch.ops.aten.addmm.default: _biased(torch.mm),
-    torch.ops.aten.baddbmm.default: _biased(torch.bmm),
-}
-
-
-def record(function: Callable[..., Any], inputs: Sequence[Tensor], fusable: bool = False) -> GraphModule:
+def record(function: Callable[..., Any], inputs: Sequence[Tensor]) -> GraphModule:
     """The tensor operations of ``function(*inputs)``, gradients and in-place changes included, as a graph.
 
     The function runs once, for real, and believes that it is being compiled; a decision that it takes on a tensor's
-    value raises ``RuntimeError``. Tensors that it uses without being given them are referred to. ``fusable`` takes some
-    operations apart, for :func:`compile_record`; without it the graph repeats the function bit for bit.
+    value raises ``RuntimeError``. Tensors that it uses without being given them are referred to.
     """
     with torch.compiler._compile_session_context(), _torchrl_told_so():
-        return make_fx(function, decomposition_table=_FUSABLE if fusable else {})(*inputs)
+        return make_fx(function)(*inputs)
 
 
 @contextmanager

@@ -31,7 +31,7 @@ class Args(run.RunArgs):
     action_repeat: int = 1
     """Simulator steps for each action."""
     steps: int = 16
-    """Steps each env takes before as many updates; 1 is the papers' schedule, a tenth slower."""
+    """Steps each env takes before as many updates; 1 is the papers' schedule."""
     asynchronous: bool = False
     """Collect in another process while this one updates: rollouts are one update old, see train/policy_lag."""
     random_frames: int = 10_000

@@ -66,7 +66,7 @@ def trace(
 
     with torch.no_grad(), torch.random.fork_rng(devices=[]), set_exploration_type(ExplorationType.RANDOM):
         try:
-            graph = record(act, inputs, fusable=compile)
+            graph = record(act, inputs)
         except RuntimeError as error:
             if "proxy" not in str(error) and "trac" not in str(error):
                 raise

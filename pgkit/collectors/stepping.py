@@ -105,25 +105,20 @@ class _Memory:
 def _unchecked(entries: dict[Any, Any]) -> TensorDictBase:
     """A TensorDict of tensors ``[N, T, ...]``; checking each entry costs a tenth of a millisecond a rollout."""
     shape = next(iter(entries.values())).shape[:2]
-    return TensorDict._new_unsafe(source=entries, batch_size=shape)  # type: ignore[no-any-return]
+    return TensorDict._new_unsafe(source=entries, batch_size=shape)
 
 
 def as_rollout(arrays: Arrays, split: Callable[[Tensor], dict[str, Tensor]] = whole) -> TensorDictBase:
     """The arrays ``[T, N, ...]`` as a TensorDict ``[N, T]``, without a copy, and ``("next", "done")``."""
-    now: dict[Any, Any] = {}
-    after: dict[Any, Any] = {}
-    deeper: dict[Any, Any] = {}
-    for key, array in arrays.items():
-        entries, name = (
-            (now, key) if isinstance(key, str) else (after, key[-1]) if key[:-1] == ("next",) else (deeper, key)
-        )
-        entries[name] = torch.from_numpy(array).transpose(0, 1)
-    now = split(now.pop("observation")) | now
+    tensors: dict[Any, Tensor] = {key: torch.from_numpy(array).transpose(0, 1) for key, array in arrays.items()}
+    after = {key[1]: tensors.pop(key) for key in arrays if key[0] == "next"}
+    nested = {key: tensors.pop(key) for key in list(tensors) if isinstance(key, tuple)}
+    now = split(tensors.pop("observation")) | tensors
     after = split(after.pop("observation")) | after
     if "action_mask" in now and not now["action_mask"].any(-1).all():
         raise UserError("the environment's action_mask allows no action in some state: it must allow at least one")
     after["done"] = after["terminated"] | after["truncated"]
     rollout = _unchecked({**now, "next": _unchecked(after)})
-    for key, tensor in deeper.items():
+    for key, tensor in nested.items():
         rollout.set(key, tensor)
     return rollout

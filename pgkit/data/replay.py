@@ -134,9 +134,10 @@ class ReplayBuffer:
             _write(self.frames[key], self.rows, first, x)
 
         ends = done.squeeze(-1)
-        for key, x in obs.items() if steps > 1 else ():
-            broken = (next_obs[key][:-columns] != x[columns:]).flatten(1).any(-1)
-            ends = torch.cat([ends[:-columns] | broken, ends[-columns:]])
+        if steps > 1:
+            ends = ends.clone()
+            for key, x in obs.items():
+                ends[:-columns] |= (next_obs[key][:-columns] != x[columns:]).flatten(1).any(-1)
         if ends.any():
             where = ends.nonzero().squeeze(-1)
             self._keep_finals(first + where, {key: x[where] for key, x in next_obs.items()})

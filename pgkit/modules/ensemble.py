@@ -11,7 +11,10 @@ from torch import Tensor, nn
 
 
 class EnsembleLinear(nn.Module):
-    """``num`` linear layers as one ``baddbmm``: ``[num, B, in] -> [num, B, out]``; orthogonal weights, zero biases."""
+    """``num`` linear layers as one ``bmm``: ``[num, B, in] -> [num, B, out]``; orthogonal weights, zero biases.
+
+    The bias is added apart, where a compiler adds it in the activation's kernel: ``baddbmm`` copies it out first.
+    """
 
     def __init__(self, num: int, in_features: int, out_features: int, gain: float) -> None:
         super().__init__()
@@ -21,7 +24,7 @@ class EnsembleLinear(nn.Module):
             nn.init.orthogonal_(member, gain)
 
     def forward(self, x: Tensor) -> Tensor:
-        return torch.baddbmm(self.bias, x, self.weight)
+        return torch.bmm(x, self.weight) + self.bias
 
 
 class EnsembleLayerNorm(nn.Module):

@@ -85,7 +85,7 @@ class OnPolicyUpdate:
         self.compile, self.frames = compile, 0
         self._generator = torch.Generator().manual_seed(int(torch.randint(2**62, ())) if seed is None else seed)
         self._step: GradientStep | None = None
-        self._keys: list[Any] | None = None
+        self._keys: list[Any] = []
         self._estimate: Block | None = None
         self._estimate_seconds = 0.0
         self._batch: TensorDictBase | None = None
@@ -156,7 +156,7 @@ class OnPolicyUpdate:
         if self.advantage is not None:
             self._estimate = self._estimate or self._prepare(self.advantage, rollout)
             self._estimate(rollout)
-        if self._keys is None or self._step is None:
+        if self._step is None:
             self._keys = wiring.read_keys(self.loss, rollout)
         return as_rows(rollout.select(*self._keys), self.sequence_length)
 

@@ -9,6 +9,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
+from torch.fx import GraphModule
 
 from pgkit.compiling import compile_record, record
 
@@ -41,19 +42,7 @@ def recorded(step: Step, held: Sequence[Tensor], data: TensorDictBase, index: Te
         metrics, grads = step(rows, inputs[-1])
         return [metrics, *grads]
 
-    before = [tensor.detach().clone() for tensor in held]
-
-    def undone(function: Callable[[], Any]) -> Any:
-        """The function's result; what it did to ``held`` and to the random generator is undone."""
-        try:
-            with torch.random.fork_rng(devices=[]):
-                return function()
-        finally:
-            with torch.no_grad():
-                for tensor, value in zip(held, before, strict=True):
-                    tensor.copy_(value)
-
-    graph = undone(lambda: record(flat, [*held, *(data[key] for key in keys), index], fusable=True))
+    graph = _undone(held, lambda: record(flat, [*held, *(data[key] for key in keys), index]))
     memory = {tensor.untyped_storage().data_ptr() for tensor in held}
     for node in graph.graph.find_nodes(op="get_attr"):
         constant = getattr(graph, str(node.target))
@@ -73,10 +62,22 @@ def recorded(step: Step, held: Sequence[Tensor], data: TensorDictBase, index: Te
 
     # a decision taken on values outside torch (numpy) is not seen while recording: it would show on other rows
     other = (index + 1) % (index.max() + 1)
-    expected, got = (undone(lambda f=f: f(data, other)[0]) for f in (step, run))
+    expected, got = (_undone(held, lambda f=f: f(data, other)[0]) for f in (step, run))
     if not torch.allclose(got, expected, rtol=1e-3, atol=1e-4, equal_nan=True):
         raise RuntimeError(f"the recorded step does not repeat the step on other rows: {got} is not {expected}")
     return run
+
+
+def _undone(tensors: Sequence[Tensor], function: Callable[[], Any]) -> Any:
+    """The function's result; what it did to these tensors and to the random generator is undone."""
+    before = [tensor.detach().clone() for tensor in tensors]
+    try:
+        with torch.random.fork_rng(devices=[]):
+            return function()
+    finally:
+        with torch.no_grad():
+            for tensor, value in zip(tensors, before, strict=True):
+                tensor.copy_(value)
 
 
 def recorded_block(block: TensorDictModuleBase, data: TensorDictBase) -> Block:
@@ -87,7 +88,7 @@ def recorded_block(block: TensorDictModuleBase, data: TensorDictBase) -> Block:
     Raises:
         RuntimeError: the block decides something on a tensor's value, changes a buffer, or is too long to compile soon.
     """
-    buffers = [(x, x._version, x.clone()) for x in block.buffers()]
+    buffers = list(block.buffers())
 
     def flat(*leaves: Tensor) -> list[Tensor]:
         rows = TensorDict({}, batch_size=data.batch_size)
@@ -100,10 +101,13 @@ def recorded_block(block: TensorDictModuleBase, data: TensorDictBase) -> Block:
         return [data.get(key) for key in block.in_keys]
 
     leaves = inputs(data)
-    graph = record(flat, leaves, fusable=True)
-    changed = [(x, value) for x, version, value in buffers if x._version != version]
-    for x, value in changed:
-        x.copy_(value)
+
+    def recording() -> tuple[GraphModule, bool]:
+        versions = [x._version for x in buffers]
+        graph = record(flat, leaves)
+        return graph, versions != [x._version for x in buffers]
+
+    graph, changed = _undone(buffers, recording)
     if changed or len(graph.graph.nodes) > 300:
         what = "changes a buffer" if changed else f"is {len(graph.graph.nodes)} operations, too many to compile soon"
         raise RuntimeError(f"tracing: {type(block).__name__} {what}")

@@ -19,7 +19,8 @@ def as_rows(data: TensorDictBase, length: int | None) -> TensorDictBase:
     if length is None:
         if "recurrent_state" in data.keys():
             raise UserError(
-                "the networks are recurrent, single rows do not train their memory: give sequence_length= (16, say)"
+                "the networks are recurrent, single rows do not train their memory: use OnPolicyUpdate with "
+                "sequence_length= (16, say)"
             )
         return data.reshape(-1).contiguous()
     if data.batch_size[-1] % length:

@@ -17,6 +17,7 @@ from pgkit.updates import wiring
 from pgkit.updates.chain import Chain
 from pgkit.updates.diagram import diagram
 from pgkit.updates.optimizers import parameters
+from pgkit.updates.sequences import as_rows
 from pgkit.updates.step import GradientStep
 
 CRITIC = "loss_critic"
@@ -97,7 +98,7 @@ class TrustRegionUpdate:
         """Trains on a rollout ``[num_envs, T]`` (or any batch shape)."""
         if self.advantage is not None:
             self.advantage(rollout)
-        flat = rollout.select(*wiring.read_keys(self.loss, rollout)).reshape(-1).contiguous()
+        flat = as_rows(rollout.select(*wiring.read_keys(self.loss, rollout)), None)
         if not self._names:
             self._assemble(flat)
         metrics = self._step_policy(self.loss.keep_distribution(flat.copy()))

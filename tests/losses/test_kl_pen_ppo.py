@@ -30,6 +30,8 @@ def test_values_and_gradient_by_hand():
     out = loss(batch)
     assert out["loss_objective"].item() == pytest.approx(-(1 - 3 * math.exp(1 / 8) - 0.5 * kl), abs=1e-12)
     assert out["kl"].item() == pytest.approx(kl, abs=1e-12) and out["beta"].item() == 0.5
+    estimate = (2 - 1 - math.log(2) + 2 * math.exp(1 / 8) - 1 - math.log(2) - 1 / 8) / 2  # ratio - 1 - log ratio
+    assert out["kl_approx"].item() == pytest.approx(estimate, abs=1e-12)
     # slope in w: d ratio / dw = ratio (a - w x) x: 2 * 1, 0; d KL / dw = (w x - x + 1) x = x: 1, 2 -> mean 1.5
     (slope,) = torch.autograd.grad(out["loss_objective"], list(actor.parameters()))
     assert slope.item() == pytest.approx(-(2 / 2 - 0.5 * 1.5), abs=1e-12)

@@ -133,7 +133,9 @@ def test_mistakes():
     with pytest.raises(UserError, match="minibatch_size=60 is not a multiple of sequence_length=8"):
         make(minibatch_size=60)
     _, update, collector = make(sequence_length=None)
-    with pytest.raises(UserError, match="single rows do not train their memory: give sequence_length="):
+    with pytest.raises(
+        UserError, match="single rows do not train their memory: use OnPolicyUpdate with sequence_length="
+    ):
         update(collector.rollout())
     _, update, collector = make(steps=20)
     with pytest.raises(UserError, match="sequence_length=8 does not divide the 20 steps"):

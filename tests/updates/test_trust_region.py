@@ -9,7 +9,7 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.modules import IndependentNormal, ProbabilisticActor
 
-from pgkit import advantages, envs, losses, modules, updates
+from pgkit import advantages, collectors, envs, losses, modules, updates
 from pgkit.errors import UserError
 
 
@@ -159,3 +159,14 @@ def test_a_shared_parameter_is_refused():
     optimizer = torch.optim.Adam([*actor.parameters(), *critic.parameters()])
     with pytest.raises(UserError, match=r"build the optimizer from critic.parameters\(\) alone"):
         updates.TrustRegionUpdate(losses.TRPOLoss(actor, critic), None, optimizer)
+
+
+def test_recurrent_networks_are_refused():
+    env = envs.make("CartPole-v1", num_envs=2)
+    core = modules.gru(env, 8)
+    actor = modules.categorical_actor(env, encoder=core)
+    update = updates.TrustRegionUpdate(losses.TRPOLoss(actor), None)
+    rollout = collectors.VectorCollector(env, actor, frames_per_batch=16).rollout()
+    rollout["advantage"] = torch.randn(2, 8, 1)
+    with pytest.raises(UserError, match="use OnPolicyUpdate with sequence_length"):
+        update(rollout)
