@@ -12,7 +12,7 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 from torch.compiler import is_dynamo_compiling
-from torch.fx import GraphModule
+from torch.fx import GraphModule, Node
 from torch.fx.experimental.proxy_tensor import make_fx
 
 # the same random numbers as eager code; tensors referred to, never copied into the code as numbers
@@ -44,7 +44,34 @@ def record(function: Callable[..., Any], inputs: Sequence[Tensor]) -> GraphModul
     value raises ``RuntimeError``. Tensors that it uses without being given them are referred to.
     """
     with torch.compiler._compile_session_context(), _torchrl_told_so():
-        return make_fx(function)(*inputs)
+        graph = make_fx(function)(*inputs)
+    _mask_in_place(graph)
+    return graph
+
+
+def _mask_in_place(graph: GraphModule) -> None:
+    """Rewrites ``x[mask] -= 1``, which picks as many elements as the mask's values say, for all elements of ``x``."""
+    aten = torch.ops.aten
+    for put in graph.graph.find_nodes(op="call_function", target=aten.index_put_.default):
+        x, masks, pick = put.args[:3]
+        while pick.target is not aten.index.Tensor and _is_elementwise(pick):
+            pick = pick.all_input_nodes[0]
+        if pick.args != (x, masks) or len(pick.users) != 1 or masks[0].meta["val"].dtype is not torch.bool:
+            continue
+        with graph.graph.inserting_before(pick):
+            pick.replace_all_uses_with(graph.graph.call_function(aten.clone.default, (x,)))
+        with graph.graph.inserting_before(put):
+            masked = graph.graph.call_function(aten.where.self, (masks[0], put.args[2], x))
+            put.replace_all_uses_with(graph.graph.call_function(aten.copy_.default, (x, masked)))
+        graph.graph.erase_node(put)
+        graph.graph.erase_node(pick)
+    graph.recompile()
+
+
+def _is_elementwise(node: Node) -> bool:
+    """Whether this is an elementwise operation on one tensor and numbers, and its result is used once."""
+    one = len(node.all_input_nodes) == len(node.users) == 1
+    return one and torch.Tag.pointwise in getattr(node.target, "tags", ())
 
 
 @contextmanager

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -12,13 +12,20 @@ from torch import Tensor
 from torch.fx import GraphModule
 
 from pgkit.compiling import compile_record, record
+from pgkit.updates.decisions import Decisions
 
 Block = Callable[[TensorDictBase], TensorDictBase]
-Step = Callable[[TensorDictBase, Tensor], tuple[Tensor, list[Tensor]]]
+Result = tuple[Tensor, list[Tensor]]
+Step = Callable[[TensorDictBase, Tensor], Result]
+_MOST_GRAPHS = 3  # of one step, for different decisions: each takes seconds to compile
 
 
 def recorded(step: Step, held: Sequence[Tensor], data: TensorDictBase, index: Tensor) -> Step:
-    """``step`` as one compiled graph, for data and indices of these shapes.
+    """``step`` as compiled graphs, for data and indices of these shapes.
+
+    A step that decides something on tensors' values (``if kl > bound``) gets a graph for the decisions that it takes
+    here; the graph tests them and changes nothing where one comes out otherwise. Up to three sets of decisions are
+    recorded, as they occur; others run the step itself.
 
     The recording runs the step, and so does a check that the compiled graph repeats it on other rows; both are undone.
 
@@ -29,18 +36,58 @@ def recorded(step: Step, held: Sequence[Tensor], data: TensorDictBase, index: Te
         index: example indices ``[B]``.
 
     Raises:
-        RuntimeError: the step decides something on a tensor's value, works on a tensor that shares memory with one of
-            ``held`` without being it, or does not repeat itself on other rows.
+        RuntimeError: the step reads a number that is another on other rows, works on a tensor that shares memory with
+            one of ``held`` without being it, or does not repeat itself on other rows.
     """
+    first, decisions = _graph(step, held, data, index)
+    for shift in range(1, 5):  # a decision taken on values outside torch (numpy) is not seen: it shows on other rows
+        other = (index + shift * (len(index) + 1)) % (index.max() + 1)
+        expected, got = (_undone(held, lambda f=f, rows=other: f(data, rows)) for f in (step, first))
+        if got is None and decisions.numbers:
+            raise RuntimeError("the step reads a number off a tensor, and it is another on other rows")
+        if got is not None and not torch.allclose(got[0], expected[0], rtol=1e-3, atol=1e-4, equal_nan=True):
+            raise RuntimeError(f"recorded, the step differs on other rows: {got[0]} is not {expected[0]}")
+    if not decisions:
+        return cast(Step, first)
+    graphs = [first]
+
+    def run(data: TensorDictBase, index: Tensor) -> Result:
+        random = torch.get_rng_state()
+        for position, graph in enumerate(graphs):
+            result = graph(data, index)
+            if result is not None:
+                graphs.insert(0, graphs.pop(position))
+                return result
+            torch.set_rng_state(random)
+        if len(graphs) < _MOST_GRAPHS:
+            graphs.insert(0, _graph(step, held, data, index)[0])
+        return step(data, index)
+
+    return run
+
+
+def _graph(
+    step: Step, held: Sequence[Tensor], data: TensorDictBase, index: Tensor
+) -> tuple[Callable[[TensorDictBase, Tensor], Result | None], Decisions]:
+    """The step as one graph, and the decisions it was recorded with; it gives None where they are others."""
     keys = list(data.keys(True, True))
+    decisions = Decisions()
 
     def flat(*inputs: Tensor) -> list[Tensor]:
         leaves = dict(zip(keys, inputs[len(held) : -1], strict=True))
         rows = data.copy()  # of nested TensorDicts too, so that ``data`` stays as it is
         for key, leaf in leaves.items():
             rows.set(key, leaf)
-        metrics, grads = step(rows, inputs[-1])
-        return [metrics, *grads]
+        before = [tensor.detach().clone() for tensor in inputs[: len(held)]]
+        with decisions:
+            metrics, grads = step(rows, inputs[-1])
+        if not decisions:
+            return [metrics, *grads]
+        as_recorded = decisions.hold()
+        with torch.no_grad():
+            for tensor, value in zip(inputs, before):
+                tensor.copy_(torch.where(as_recorded, tensor, value))
+        return [as_recorded, metrics, *grads]
 
     graph = _undone(held, lambda: record(flat, [*held, *(data[key] for key in keys), index]))
     memory = {tensor.untyped_storage().data_ptr() for tensor in held}
@@ -52,20 +99,18 @@ def recorded(step: Step, held: Sequence[Tensor], data: TensorDictBase, index: Te
     code = compile_record(graph, [*fixed, *(data[key] for key in keys), index])
     rows, leaves = data, [data[key] for key in keys]
 
-    def run(data: TensorDictBase, index: Tensor) -> tuple[Tensor, list[Tensor]]:
+    def run(data: TensorDictBase, index: Tensor) -> Result | None:
         nonlocal rows, leaves
         if data is not rows:
             rows, leaves = data, [data[key] for key in keys]
         with torch.no_grad():
-            metrics, *grads = code(*fixed, *leaves, index)
+            out = code(*fixed, *leaves, index)
+        if decisions and not out.pop(0):
+            return None
+        metrics, *grads = out
         return metrics, grads
 
-    # a decision taken on values outside torch (numpy) is not seen while recording: it would show on other rows
-    other = (index + 1) % (index.max() + 1)
-    expected, got = (_undone(held, lambda f=f: f(data, other)[0]) for f in (step, run))
-    if not torch.allclose(got, expected, rtol=1e-3, atol=1e-4, equal_nan=True):
-        raise RuntimeError(f"the recorded step does not repeat the step on other rows: {got} is not {expected}")
-    return run
+    return run, decisions
 
 
 def _undone(tensors: Sequence[Tensor], function: Callable[[], Any]) -> Any:

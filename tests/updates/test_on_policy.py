@@ -148,6 +148,104 @@ def test_two_compiled_agents_in_one_process_do_not_mix():
     assert not torch.equal(parameters(pair[0]) - start[0], parameters(pair[1]) - start[1])
 
 
+@pytest.mark.parametrize(
+    "optimizer",
+    [
+        partial(torch.optim.SGD, momentum=0.9, nesterov=True, weight_decay=0.1),
+        partial(torch.optim.RMSprop, momentum=0.9, centered=True, weight_decay=0.1, maximize=True),
+        torch.optim.AdamW,
+        torch.optim.Adagrad,
+    ],
+)
+def test_every_optimizer_compiles(optimizer):
+    a, b = (make_agent(compile=mode, optimizer=optimizer, epochs=1) for mode in ("on", "off"))
+    for i in range(3):
+        for update in (a, b):
+            update.optimizer.param_groups[0]["lr"] = 1e-3 * (i + 1)
+            update(make_rollout(i))
+    torch.testing.assert_close(parameters(a), parameters(b), rtol=1e-4, atol=1e-5)
+
+
+def test_a_recorded_advantage_follows_weights_and_settings_and_leaves_other_layouts_to_the_block():
+    update = make_agent(compile="on", epochs=1, minibatch_size=None)
+    update(make_rollout())
+    block: Any = update.advantage
+    assert update._estimate is not None and update._estimate is not block
+    other = make_rollout(3, rows=(64, 2)).transpose(0, 1)  # the same shape, other strides
+    for rollout in (make_rollout(1), make_rollout(2), other):
+        with torch.no_grad():
+            for parameter in block.critic.parameters():
+                parameter.add_(0.1)
+        block.gamma.mul_(0.9)
+        expected, got = block(rollout.clone()), update._estimate(rollout.clone(recurse=False))
+        for key in block.out_keys:
+            torch.testing.assert_close(got[key], expected[key])
+
+
+def test_an_advantage_that_changes_its_buffers_is_not_recorded():
+    class Counting(advantages.GAE):
+        def estimate(self, value, next_value, rollout):
+            self.gamma.mul_(0.9)
+            return super().estimate(value, next_value, rollout)
+
+    block = Counting(modules.state_value(envs.make("Pendulum-v1")))
+    with pytest.raises(RuntimeError, match="changes a buffer"):
+        recorded_block(block, make_rollout())
+    assert block.gamma == torch.tensor(0.99)
+
+
+def test_compiled_step_follows_normalizers_coefficients_and_learning_rate():
+    def agent(mode):
+        torch.manual_seed(0)
+        env = envs.make("Pendulum-v1")
+        normalizer = modules.ObsNormalizer(env)
+        actor, critic = (f(env, normalizer=normalizer) for f in (modules.gaussian_actor, modules.state_value))
+        update = updates.OnPolicyUpdate(
+            losses.ClipPPOLoss(actor, critic, entropy_coeff=0.1),
+            advantages.GAE(critic),
+            torch.optim.Adam([*actor.parameters(), *critic.parameters()]),
+            compile=mode,
+            epochs=1,
+            seed=0,
+        )
+        out = []
+        for i in range(3):
+            out.append(update(make_rollout(i)))
+            normalizer.update(make_rollout(i)["observation"] * 3 + 1)
+            update.loss.entropy_coeff = 0.1 * i
+            update.loss.clip_epsilon = 0.01
+            update.optimizer.param_groups[0]["lr"] = 1e-2
+        return out
+
+    for a, b in zip(agent("on"), agent("off"), strict=True):
+        assert a == pytest.approx(b, rel=1e-3, abs=1e-4)
+
+
+@pytest.mark.parametrize("loss_class", [losses.ClipPPOLoss, TorchRLClipPPOLoss])
+def test_eager_and_compiled_agree(loss_class, caplog):
+    caplog.set_level("DEBUG", "pgkit")
+    eager, compiled = (make_agent(dtype=torch.float64, loss_class=loss_class, compile=mode) for mode in ("off", "on"))
+    for i in range(20):
+        a, b = (update(make_rollout(i, torch.float64)) for update in (eager, compiled))
+        assert a.keys() == b.keys()
+        assert a == pytest.approx(b, rel=1e-5, abs=1e-7)
+    torch.testing.assert_close(parameters(eager), parameters(compiled), rtol=0, atol=1e-5)
+    assert compiled.compile_seconds > 0 == eager.compile_seconds
+    assert "cannot be recorded" not in caplog.text
+
+
+def test_two_compiled_agents_in_one_process_do_not_mix():
+    pair = [make_agent(seed, torch.float64, compile="on") for seed in (0, 1)]
+    alone = make_agent(1, torch.float64, compile="off")
+    start = [parameters(update).clone() for update in pair]
+    for i in range(3):
+        for update in pair:
+            update(make_rollout(i, torch.float64))
+        alone(make_rollout(i, torch.float64))
+    torch.testing.assert_close(parameters(pair[1]), parameters(alone), rtol=0, atol=1e-6)
+    assert not torch.equal(parameters(pair[0]) - start[0], parameters(pair[1]) - start[1])
+
+
 def test_decisions_outside_torch_are_not_recorded():
     def surrogate(log_ratio, advantage):
         sign = 1.0 if advantage.detach().numpy()[0] > 0 else -1.0

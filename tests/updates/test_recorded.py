@@ -1,0 +1,115 @@
+"""What a step may do and still be one compiled graph."""
+
+import pytest
+import torch
+
+from pgkit.compiling import record
+from tests.updates.test_on_policy import make_agent, make_rollout, parameters
+
+
+def both(surrogate, rollouts, mode="auto"):
+    """The same agent compiled and eager, after an update on each rollout; their metrics agree at each."""
+    compiled, eager = (make_agent(compile=c, epochs=1, dtype=torch.float64) for c in (mode, "off"))
+    for i, rollout in enumerate(rollouts):
+        metrics = []
+        for update in (compiled, eager):
+            update.loss.surrogate = surrogate
+            torch.manual_seed(i)
+            metrics.append(update(rollout.clone()))
+        assert metrics[0] == pytest.approx(metrics[1], rel=1e-4, abs=1e-6)
+    torch.testing.assert_close(parameters(compiled), parameters(eager), rtol=0, atol=1e-5)
+    return compiled
+
+
+def rollouts(count=4):
+    return [make_rollout(i, torch.float64) for i in range(count)]
+
+
+@pytest.fixture
+def log(caplog):
+    caplog.set_level("DEBUG", "pgkit")
+    return caplog
+
+
+def test_a_branch_on_a_value_gets_a_graph_of_its_own(log):
+    taken = []
+
+    def surrogate(log_ratio, advantage):
+        noise = 1 + 0.1 * torch.randn_like(log_ratio)  # a graph that is given up must give its random numbers back
+        up = bool(noise.mean() > 1)
+        taken.append(up)
+        return noise * log_ratio.exp() * advantage if up else advantage.abs() * log_ratio
+
+    both(surrogate, rollouts())
+    assert set(taken) == {True, False}
+    assert "cannot be recorded" not in log.text
+
+
+def test_more_branches_than_graphs_run_as_they_are(log):
+    taken = set()
+
+    def surrogate(log_ratio, advantage):
+        count = sum(bool(advantage.max() > threshold) for threshold in (1.8, 2.0, 2.2, 2.4, 2.6))
+        taken.add(count)
+        return (1 + 0.1 * count) * log_ratio.exp() * advantage
+
+    both(surrogate, rollouts(6))
+    assert len(taken) > 3
+    assert "cannot be recorded" not in log.text
+
+
+def test_a_number_that_stays_is_recorded(log):
+    ends = torch.tensor([-2.0, 2.0])
+
+    def surrogate(log_ratio, advantage):
+        return log_ratio.clamp(ends.min().item(), ends.max().item()).exp() * advantage
+
+    both(surrogate, rollouts(1))
+    assert "cannot be recorded" not in log.text
+
+
+@pytest.mark.parametrize(
+    "surrogate",
+    [
+        lambda log_ratio, advantage: log_ratio.exp() * advantage / float(advantage.detach().abs().max()),
+        lambda log_ratio, advantage: (log_ratio.exp() * advantage)[advantage > 0].mean().expand_as(advantage),
+    ],
+    ids=["a number that changes", "as many rows as the values say"],
+)
+def test_what_cannot_be_recorded_goes_to_torch_compile(surrogate, log):
+    both(surrogate, rollouts(1), mode="on")
+    assert "cannot be recorded" in log.text
+
+
+def test_what_cannot_be_compiled_runs_without(log):
+    def surrogate(log_ratio, advantage):
+        return log_ratio.exp() * advantage * (2.0 if float(advantage.max()) > 2 else 1.0)
+
+    both(surrogate, rollouts(1))
+    assert "cannot be compiled and runs without" in log.text
+    with pytest.raises(torch._dynamo.exc.TorchDynamoException):
+        both(surrogate, rollouts(1), mode="on")
+
+
+def test_decisions_outside_torch_are_not_recorded(log):
+    def surrogate(log_ratio, advantage):
+        sign = 1.0 if advantage.detach().numpy()[0] > 0 else -1.0
+        return sign * log_ratio.exp() * advantage
+
+    both(surrogate, rollouts(1))
+    assert "differs on other rows" in log.text
+
+
+def test_masked_assignments_are_recorded_for_all_elements():
+    def assign(x, u):
+        x = x + 1
+        x[(u > 0) & (x == u)] -= 1
+        x[u > 2] *= u.mean()
+        x[u > 3] = 7
+        x[u.long()] += 1  # indices, not a mask
+        return x
+
+    x, u = torch.tensor([0.0, 0, 1, 2]), torch.tensor([1.0, 1, 3, 3])
+    graph = record(lambda x, u: [assign(x, u)], [x, u])
+    for inputs in ((x, u), (u, x), (torch.tensor([5.0, 0, 2, 1]), torch.tensor([3.0, 1, 0, 2]))):
+        torch.testing.assert_close(graph(*inputs)[0], assign(*inputs))
