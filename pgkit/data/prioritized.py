@@ -28,6 +28,11 @@ class Prioritized:
         self.beta = torch.tensor(float(beta))
         self.largest = torch.ones(1, dtype=torch.float64)  # [1]: a compiled graph loses writes to a float64 scalar
 
+    @property
+    def tensors(self) -> list[Tensor]:
+        """What :meth:`write_back` changes."""
+        return [*self.tree.levels, self.largest]
+
     def begin(self, rows: int) -> TensorDictBase:
         """Makes the tree; the result is what a batch's weights are made from."""
         self.tree = SumTree(rows)

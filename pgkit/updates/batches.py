@@ -18,9 +18,6 @@ Draw = tuple[TensorDictBase, Tensor]
 class Batches(Protocol):
     """A source of batches for :class:`~pgkit.updates.GradientStep`."""
 
-    record: bool
-    """Whether a step on them writes into nothing but the loss and the optimizer, so that it can be recorded."""
-
     def extend(self, rollout: TensorDictBase) -> None:
         """Stores a rollout."""
         ...
@@ -37,6 +34,10 @@ class Batches(Protocol):
         """The batch's priorities to where they belong, in the graph."""
         ...
 
+    def written(self) -> list[Tensor]:
+        """What :meth:`write_back` changes, besides ``data``."""
+        ...
+
     def drawn(self) -> None:
         """Called after each step, outside the graph."""
         ...
@@ -50,7 +51,7 @@ class OwnBatches:
     """From pgkit's replay: only row numbers are drawn, the rest is in the graph."""
 
     def __init__(self, buffer: ReplayBuffer, loss: nn.Module, batch_size: int) -> None:
-        self.buffer, self.batch_size, self.record = buffer, batch_size, buffer.sampler is None
+        self.buffer, self.batch_size = buffer, batch_size
         self._gather = buffer.gather(discount(loss) if buffer.n_steps > 1 else 1.0)
 
     def extend(self, rollout: TensorDictBase) -> None:
@@ -61,6 +62,9 @@ class OwnBatches:
 
     def write_back(self, data: TensorDictBase, index: Tensor, batch: TensorDictBase) -> None:
         self.buffer.write_back(data, index, batch)
+
+    def written(self) -> list[Tensor]:
+        return [] if self.buffer.sampler is None else self.buffer.sampler.tensors
 
     def draw(self, batches: int) -> Iterator[Draw]:
         at_once = 1 if self.buffer.sampler is not None else max(batches, 1)  # priorities change with every step
@@ -79,7 +83,7 @@ class TorchRLBatches:
     """From a TorchRL replay buffer: its ``sample()`` is called for every step, ``td_error`` is written back to it."""
 
     def __init__(self, buffer: Any, loss: nn.Module, batch_size: int) -> None:
-        self.buffer, self.loss, self.batch_size, self.record = buffer, loss, batch_size, False
+        self.buffer, self.loss, self.batch_size = buffer, loss, batch_size
         self.priority = getattr(loss.tensor_keys, "priority", "td_error")
         self.prioritized = (
             hasattr(getattr(buffer, "sampler", None), "update_priority")
@@ -103,6 +107,9 @@ class TorchRLBatches:
     def write_back(self, data: TensorDictBase, index: Tensor, batch: TensorDictBase) -> None:
         if self.prioritized:
             data[self.priority].copy_(batch[self.priority].flatten())
+
+    def written(self) -> list[Tensor]:
+        return []
 
     def drawn(self) -> None:
         if self.prioritized:

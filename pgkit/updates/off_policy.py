@@ -154,7 +154,7 @@ class OffPolicyUpdate:
             "write_back": self._batches.write_back,
             # a step costs 10 times a PPO step, so compiling pays 10 times sooner
             "compile": worth_compiling(self.compile, steps, least_calls=3_000),
-            "record": self._batches.record,
+            "written": self._batches.written(),
             "may_fall_back": self.compile == "auto",
         }
         self._steps[True] = GradientStep(self.loss, self.optimizer, names, **settings)

@@ -188,7 +188,6 @@ class OnPolicyUpdate:
             max_grad_norm=self.max_grad_norm,
             before=_standardize_advantage if self.normalize_advantage else None,
             compile=worth_compiling(self.compile, steps, least_calls=30_000),
-            record=True,
             may_fall_back=self.compile == "auto",
         )
 

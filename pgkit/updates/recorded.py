@@ -85,7 +85,7 @@ def _graph(
             return [metrics, *grads]
         as_recorded = decisions.hold()
         with torch.no_grad():
-            for tensor, value in zip(inputs, before):
+            for tensor, value in zip(inputs[: len(held)], before, strict=True):
                 tensor.copy_(torch.where(as_recorded, tensor, value))
         return [as_recorded, metrics, *grads]
 
@@ -95,6 +95,8 @@ def _graph(
         constant = getattr(graph, str(node.target))
         if isinstance(constant, Tensor) and constant.untyped_storage().data_ptr() in memory:
             raise RuntimeError(f"tracing: '{node.target}' shares memory with a parameter or buffer without being it")
+        if any(user.args[0] is node and torch.Tag.inplace in user.target.tags for user in node.users):
+            raise RuntimeError(f"tracing: the step writes to '{node.target}', which is none of what it holds")
     fixed = [tensor.detach() for tensor in held]
     code = compile_record(graph, [*fixed, *(data[key] for key in keys), index])
     rows, leaves = data, [data[key] for key in keys]

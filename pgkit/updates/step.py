@@ -27,9 +27,9 @@ class GradientStep:
     """``step(data, index) -> metrics``: one optimizer step on the sum of the ``loss_*`` entries at ``data[index]``.
 
     Compiled, all of it is one graph: the gather, the loss, ``autograd.grad``, the norm clip, the optimizer's own
-    function on the optimizer's own state, and ``after``. There are two ways to the graph. With ``record``, the step is
-    recorded as tensor operations and compiled for exactly these tensors, without dynamo at run time
-    (:mod:`~pgkit.updates.recorded`). Otherwise, and for losses that cannot be recorded, it is one
+    function on the optimizer's own state, and ``after``. There are two ways to the graph. The step is recorded as
+    tensor operations and compiled for exactly these tensors, without dynamo at run time
+    (:mod:`~pgkit.updates.recorded`). Where it cannot be recorded, it is one
     ``torch.compile(fullgraph=True)`` graph; once a pair of shapes has been seen, calls skip dynamo's guards. An
     optimizer without a functional form steps outside the graph.
 
@@ -44,8 +44,7 @@ class GradientStep:
         write_back: called with ``(data, index, minibatch)`` after the loss, without gradients (priorities).
         only: the ``loss_*`` entries to step on and the parameters each trains; the others stay. None: all.
         compile: compile the step.
-        record: try to record it first; the step may change no tensors but parameters, the loss's buffers and the
-            optimizer's state.
+        written: what ``write_back`` changes, besides ``data``.
         may_fall_back: a step that cannot be compiled runs as it is, with a warning, in place of raising.
     """
 
@@ -62,7 +61,7 @@ class GradientStep:
         write_back: Callable[[TensorDictBase, Tensor, TensorDictBase], None] | None = None,
         only: Mapping[str, Sequence[Tensor]] | None = None,
         compile: bool = False,
-        record: bool = False,
+        written: Sequence[Tensor] = (),
         may_fall_back: bool = False,
     ) -> None:
         self.optimizer, self.loss = optimizer, loss
@@ -102,7 +101,7 @@ class GradientStep:
         code = step.__code__.replace(co_name=f"step_{id(self)}")
         step = types.FunctionType(code, step.__globals__, step.__name__, None, step.__closure__)
         self._eager, self._after, self._params = step, after, params
-        self._compile, self._record, self._may_fall_back = compile, record, may_fall_back
+        self._compile, self._written, self._may_fall_back = compile, written, may_fall_back
 
     def begin(self) -> None:
         """Reads the learning rates off the optimizer; call it before a series of steps."""
@@ -145,14 +144,13 @@ class GradientStep:
 
     def _build(self, data: TensorDictBase, index: Tensor) -> tuple[Step, tuple[Tensor, list[Tensor]]]:
         """The compiled step for these shapes, and the result of its first call."""
-        if self._record:
-            states = [x for p in self._params for x in self.optimizer.state.get(p, {}).values() if torch.is_tensor(x)]
-            held = [*self._params, *states, *self._rates, *self.loss.parameters(), *self.loss.buffers()]
-            try:
-                run = recorded(self._eager, list({id(x): x for x in held}.values()), data, index)
-                return run, run(data, index)
-            except RuntimeError as error:
-                getLogger("pgkit").debug("the step cannot be recorded (%s): torch.compile", error)
+        states = [x for p in self._params for x in self.optimizer.state.get(p, {}).values() if torch.is_tensor(x)]
+        held = [*self._params, *states, *self._rates, *self.loss.parameters(), *self.loss.buffers(), *self._written]
+        try:
+            run = recorded(self._eager, list({id(x): x for x in held}.values()), data, index)
+            return run, run(data, index)
+        except RuntimeError as error:
+            getLogger("pgkit").debug("the step cannot be recorded (%s): torch.compile", error)
         # fallback_random: the same random numbers as eager code
         compiled = torch.compile(self._eager, fullgraph=True, dynamic=False, options={"fallback_random": True})
 

@@ -177,7 +177,6 @@ class TrustRegionUpdate:
             max_grad_norm=self.max_grad_norm,
             only={CRITIC: critic},
             compile=worth_compiling(self.compile, steps, least_calls=30_000),
-            record=True,
             may_fall_back=self.compile == "auto",
         )
 

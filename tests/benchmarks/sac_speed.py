@@ -167,8 +167,7 @@ def replay(threads: int, prioritized: bool) -> dict[str, float]:
     batch = update._batches.gather(buffer.data, index)
     loss, optimizer = update.loss, update.optimizer
     bare = updates.GradientStep(
-        loss, optimizer, whole.names[:-1], after=update._average, gather=lambda data, _: data.copy(), compile=True,
-        record=update._batches.record,
+        loss, optimizer, whole.names[:-1], after=update._average, gather=lambda data, _: data.copy(), compile=True
     )  # fmt: skip
     bare(batch, index)
     times: dict[str, list[float]] = {"write": [], "draw": [], "step": [], "step without gather": []}

@@ -93,7 +93,7 @@ def pgkit_step(loss: Any, rollout: TensorDict, compiled: bool) -> tuple[Gradient
     flat = rollout.select(*read_keys(loss, rollout)).reshape(-1).contiguous()
     names = [key for key, value in loss(flat[:ROWS]).items() if value.numel() == 1]
     optimizer = torch.optim.Adam(loss.parameters(), lr=3e-4)
-    step = GradientStep(loss, optimizer, names, max_grad_norm=0.5, compile=compiled, record=True)
+    step = GradientStep(loss, optimizer, names, max_grad_norm=0.5, compile=compiled)
     step.begin()
     return step, flat
 
