@@ -95,4 +95,5 @@ def compile_record(graph: GraphModule, inputs: Sequence[Tensor]) -> Callable[...
     """Inductor's code for a recorded graph. It checks nothing: call it with tensors like ``inputs`` and no others."""
     with torch.no_grad():
         options = {**_OPTIONS, "size_asserts": False, "alignment_asserts": False}
-        return cast(Callable[..., Any], torch._inductor.compile(graph, list(inputs), options=options))
+        code = torch._inductor.compile(graph, list(inputs), options=options)
+    return cast(Callable[..., Any], getattr(code, "__wrapped__", code))  # the wrapper only keeps dynamo out

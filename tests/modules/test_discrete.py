@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
-from torch.distributions import Categorical
+from torch import distributions
 from torchrl.modules import MaskedCategorical
 
 from pgkit import collectors, envs, modules
 from pgkit.errors import UserError
-from pgkit.modules.discrete import MultiCategorical
+from pgkit.modules.discrete import Categorical, MultiCategorical
 
 
 class Masked(gym.Env):
@@ -93,3 +93,21 @@ def test_a_mask_that_allows_nothing_is_refused():
     collector = collectors.VectorCollector(env, modules.categorical_actor(env), frames_per_batch=8, compile="off")
     with pytest.raises(UserError, match="action_mask allows no action"):
         collector.rollout()
+
+
+@pytest.mark.parametrize("shape", [(), (7,)])
+def test_draws_are_torch_s_numbers(shape):
+    logits = torch.randn(5, 3)
+    draws = []
+    for kind in (Categorical, distributions.Categorical):
+        torch.manual_seed(0)
+        draws.append(kind(logits=logits.expand(*shape, 5, 3)).sample())
+    assert torch.equal(*draws)
+
+
+def test_several_draws_follow_the_probabilities():
+    torch.manual_seed(0)
+    probs = torch.tensor([[0.1, 0.2, 0.7], [1.0, 0.0, 0.0]])
+    draws = Categorical(probs=probs).sample((20_000,))
+    assert draws.shape == (20_000, 2)
+    torch.testing.assert_close(torch.nn.functional.one_hot(draws, 3).float().mean(0), probs, rtol=0, atol=0.01)
