@@ -16,7 +16,11 @@ from torch.fx import GraphModule, Node
 from torch.fx.experimental.proxy_tensor import make_fx
 
 # the same random numbers as eager code; tensors referred to, never copied into the code as numbers
-_OPTIONS: dict[str, Any] = {"fallback_random": True, "always_keep_tensor_constants": True}
+_OPTIONS: dict[str, Any] = {
+    "fallback_random": True,
+    "always_keep_tensor_constants": True,
+    "reorder_for_locality": False,
+}
 
 
 def worth_compiling(compile: str, calls: float | None, least_calls: float) -> bool:

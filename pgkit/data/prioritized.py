@@ -31,7 +31,7 @@ class Prioritized:
     @property
     def tensors(self) -> list[Tensor]:
         """What :meth:`write_back` changes."""
-        return [*self.tree.levels, self.largest]
+        return [self.tree.values, self.tree.sums, self.largest]
 
     def begin(self, rows: int) -> TensorDictBase:
         """Makes the tree; the result is what a batch's weights are made from."""

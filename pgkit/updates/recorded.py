@@ -70,7 +70,8 @@ def _graph(
     step: Step, held: Sequence[Tensor], data: TensorDictBase, index: Tensor
 ) -> tuple[Callable[[TensorDictBase, Tensor], Result | None], Decisions]:
     """The step as one graph, and the decisions it was recorded with; it gives None where they are others."""
-    keys = list(data.keys(True, True))
+    known = {id(tensor) for tensor in held}
+    keys = [key for key in data.keys(True, True) if id(data[key]) not in known]  # priorities are held and in the data
     decisions = Decisions()
 
     def flat(*inputs: Tensor) -> list[Tensor]:

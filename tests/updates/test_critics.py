@@ -11,6 +11,7 @@ from pgkit.run.evaluate import act
 
 BLOCKS = {
     "redq": ({"num_critics": 5}, {"subset": 2, "actor_value": "mean"}),
+    "redq of all": ({"num_critics": 2}, {"subset": 2, "actor_value": "mean"}),
     "tqc": ({"num_critics": 3, "head": heads.Quantiles(5)}, {"actor_value": "mean"}),
     "droq": ({"norm": modules.EnsembleLayerNorm, "dropout": 0.2}, {}),
     "crossq": ({"body": partial(modules.batch_renorm_mlp, hidden=(16,))}, {}),
