@@ -110,7 +110,9 @@ class QLoss(Loss):
             out = self.actor_network(batch.select(*self.actor_network.in_keys))
         return out.get(self.tensor_keys.action)
 
-    def returns(self, batch: TensorDictBase, action: Tensor, params: Any, members: Tensor | None = None) -> Tensor:
+    def returns(
+        self, batch: TensorDictBase, action: Tensor, params: Any, members: Tensor | slice | None = None
+    ) -> Tensor:
         """What the head reads, ``[*B, critics, size]``, for ``action`` at the batch's observations.
 
         ``members`` names the critics to evaluate, in the order of the result; None: all.
@@ -127,9 +129,11 @@ class QLoss(Loss):
         out = out if out.dim() > data.dim() + 1 else out.unsqueeze(-1)
         return out if members is None else out[..., members, :]
 
-    def q(self, batch: TensorDictBase, action: Tensor, params: Any) -> Tensor:
+    def q(
+        self, batch: TensorDictBase, action: Tensor, params: Any, members: Tensor | slice | None = None
+    ) -> Tensor:
         """The critics' values ``[*B, critics]`` of ``action`` at the batch's observations."""
-        return self.head.mean(self.returns(batch, action, params))
+        return self.head.mean(self.returns(batch, action, params, members))
 
     def target(self, batch: TensorDictBase, next_value: Tensor) -> Tensor:
         """The bootstrapped target of the next state's value ``[*B]``, or of its atoms ``[*B, K]``; same shape."""

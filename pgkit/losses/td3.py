@@ -121,7 +121,7 @@ class TD3Loss(QLoss):
         self.write_priority(batch, q - target)
 
         action = self.action(batch, self.actor_network_params)
-        value = self.q(batch, action, self.qvalue_network_params.detach())[..., 0]
+        value = self.q(batch, action, self.qvalue_network_params.detach(), slice(1)).squeeze(-1)
 
         out = TensorDict(
             {

@@ -62,8 +62,8 @@ class QValue(TensorDictModule):
         super().__init__(net, in_keys=["observation", "action"], out_keys=["state_action_value"])
         self.num_critics, self.head = num_critics, head
 
-    def members(self, params: Any, index: Tensor) -> Any:
-        """The parameters (and buffers) of the critics ``index [K]`` out of ``params``, for a functional call."""
+    def members(self, params: Any, index: Tensor | slice) -> Any:
+        """The parameters (and buffers) of some critics, ``index [K]`` or a slice, out of ``params``, for a functional call."""
         inner = params["module"]
         shared = {name: value for name, value in inner.items() if name != "layers"}
         return TensorDict({"module": {**shared, "layers": inner["layers"].apply(lambda x: x[index])}})
