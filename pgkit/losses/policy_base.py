@@ -75,7 +75,18 @@ class PolicyLoss(Loss):
             return self.actor_network.get_dist(batch.select(*self.actor_network.in_keys))
 
     def log_prob(self, dist: Distribution, batch: TensorDictBase) -> Tensor:
-        """Log-probability of the batch's actions, ``[*B]``; of a composite action, that of all its parts."""
+        """Log-probability of the batch's actions, ``[*B]``; of a composite action, that of all its parts.
+
+        Raises:
+            RuntimeError: an action has a gradient of its own, from a draw that was made with gradients on: it would
+                cancel part of the loss's.
+        """
+        for key in listed(self.tensor_keys.action):
+            if batch.get(key).requires_grad:
+                raise RuntimeError(
+                    f"tensordict stored {key} requires grad: collect under torch.no_grad(), or give the loss "
+                    "rollout.detach()"
+                )
         if isinstance(dist, CompositeDistribution):
             with set_composite_lp_aggregate(True):
                 return dist.log_prob(batch)

@@ -129,9 +129,7 @@ class QLoss(Loss):
         out = out if out.dim() > data.dim() + 1 else out.unsqueeze(-1)
         return out if members is None else out[..., members, :]
 
-    def q(
-        self, batch: TensorDictBase, action: Tensor, params: Any, members: Tensor | slice | None = None
-    ) -> Tensor:
+    def q(self, batch: TensorDictBase, action: Tensor, params: Any, members: Tensor | slice | None = None) -> Tensor:
         """The critics' values ``[*B, critics]`` of ``action`` at the batch's observations."""
         return self.head.mean(self.returns(batch, action, params, members))
 

@@ -108,3 +108,10 @@ def test_shapes_never_broadcast_and_the_batch_is_left_as_it_was():
     with pytest.raises(ValueError, match=r"advantage has shape \(2,\) but log_prob has shape \(2, 1\)"):
         loss(batch.set("advantage", batch["advantage"].squeeze(-1)))
     assert loss.in_keys == ["observation", "action", "advantage", "value_target", "state_value"]
+
+
+def test_an_action_with_a_gradient_of_its_own_is_refused():
+    _, _, loss, batch = by_hand()
+    batch["action"].requires_grad_()
+    with pytest.raises(RuntimeError, match=r"stored action requires grad: collect under torch.no_grad\(\)"):
+        loss(batch)

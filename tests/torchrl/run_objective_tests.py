@@ -6,7 +6,8 @@
 Before TorchRL's test files are imported, every class of ``torchrl.objectives`` that ``pgkit.losses`` has by the same
 name is replaced by pgkit's; the tests that name such a class are run, all others are left out. The tests are
 TorchRL's, unchanged, and stay where they are. Keywords that pgkit's constructors do not have are dropped where they
-change nothing (``DROPPED`` below). What remains failed, and why: docs/pages/torchrl.md.
+change nothing (``DROPPED`` below). Where a test leaves a setting to its default, it gets TorchRL's: keywords that both
+have, and the value estimator that TorchRL makes when none was. What remains failed, and why: docs/pages/torchrl.md.
 """
 
 from __future__ import annotations
@@ -16,11 +17,14 @@ import inspect
 import re
 import sys
 from collections import Counter, defaultdict
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torchrl.objectives
+from tensordict import TensorDictBase
+from torch import Tensor
 
 from pgkit import losses
 
@@ -31,20 +35,57 @@ DROPPED: dict[str, Any] = {
 """Keyword and the value at which it asks for nothing; None: at any value."""
 
 
-def adapted(cls: type) -> type:
-    """The class, with a constructor that drops the keywords above."""
+def defaults(cls: type) -> dict[str, Any]:
+    """Keyword arguments of a class's constructor, and of those of its bases, that have a default."""
+    found: dict[str, Any] = {}
+    for base in reversed(cls.__mro__):
+        parameters = inspect.signature(base.__init__).parameters if "__init__" in vars(base) else {}
+        found |= {p.name: p.default for p in parameters.values() if p.default is not p.empty}
+    return found
+
+
+def adapted(cls: type, stock: type) -> type:
+    """The class, with a constructor that drops the keywords above and has TorchRL's defaults."""
+    own, theirs = defaults(cls), defaults(stock)
+    other = {name: x for name, x in theirs.items() if name in own and x is not None and x != own[name]}
 
     def init(self: Any, *args: Any, **kwargs: Any) -> None:
         kept = {name: x for name, x in kwargs.items() if name not in DROPPED or DROPPED[name] not in (None, x)}
         if kwargs.get("value_network") is None:
             kept.pop("delay_value", None)  # of the value network that is not there
-        cls.__init__(self, *args, **kept)
+        cls.__init__(self, *args, **{**other, **kept})
+        make_default(self)
 
-    return type(cls.__name__, (cls,), {"__init__": init, "__module__": cls.__module__, "__doc__": cls.__doc__})
+    def make_default(self: Any) -> None:
+        self.made = False
+        if getattr(self, "critic_network", None) is not None:
+            with suppress(KeyError):  # the critic's keys are not set yet
+                cls.make_value_estimator(self)
+                self.made = True
+
+    def set_keys(self: Any, **kwargs: Any) -> None:
+        again = getattr(self, "made", False)
+        if again:
+            self._value_estimator = None
+        cls.set_keys(self, **kwargs)
+        if again:
+            make_default(self)
+
+    def log_probs(self: Any, tensordict: TensorDictBase) -> Tensor:
+        return self.log_prob(self.distribution(tensordict), tensordict)
+
+    members = {
+        "__init__": init,
+        "set_keys": set_keys,
+        "_log_probs": log_probs,
+        "__module__": cls.__module__,
+        "__doc__": cls.__doc__,
+    }
+    return type(cls.__name__, (cls,), members)
 
 
 NAMES = [name for name in losses.__all__ if hasattr(torchrl.objectives, name)]
-SUBSTITUTES = {name: adapted(getattr(losses, name)) for name in NAMES}
+SUBSTITUTES = {name: adapted(getattr(losses, name), getattr(torchrl.objectives, name)) for name in NAMES}
 
 
 def substitute(names: list[str]) -> None:
