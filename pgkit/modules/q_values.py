@@ -63,7 +63,7 @@ class QValue(TensorDictModule):
         self.num_critics, self.head = num_critics, head
 
     def members(self, params: Any, index: Tensor | slice) -> Any:
-        """Of the critics ``index`` (``[K]`` or a slice): parameters and buffers out of ``params``, for a functional call."""
+        """Parameters and buffers of the critics ``index`` (``[K]`` or a slice) out of ``params``, to call with."""
         inner = params["module"]
         shared = {name: value for name, value in inner.items() if name != "layers"}
         return TensorDict({"module": {**shared, "layers": inner["layers"].apply(lambda x: x[index])}})
