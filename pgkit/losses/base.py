@@ -79,5 +79,9 @@ class Loss(LossModule):
         pass
 
     def reduce(self, loss: Tensor, batch: TensorDictBase) -> Tensor:
-        """The unreduced ``[*B]`` or ``[*B, 1]`` as this loss's ``reduction`` wants it; padded entries are left out."""
-        return self._reduce_loss(loss, batch)
+        """The unreduced ``[*B]`` or ``[*B, 1]`` as this loss's ``reduction`` wants it, ``[]`` or ``[*B]``.
+
+        Padded entries are left out.
+        """
+        loss = self._reduce_loss(loss, batch)
+        return loss.squeeze(-1) if loss.dim() > batch.dim() else loss

@@ -199,3 +199,13 @@ def test_a_composite_action_is_scored_by_the_sum_of_its_parts():
     steer = torch.distributions.Normal(batch[keys[0]], batch[keys[1]])
     gear = torch.distributions.Categorical(logits=batch[keys[2]])
     torch.testing.assert_close(out["entropy"], (steer.entropy() + gear.entropy()).mean())
+
+
+def test_unreduced_losses_have_the_batch_s_shape(agent):
+    env, actor, critic = agent
+    batch = make_batch(actor, env)
+    out = losses.ClipPPOLoss(actor, critic, entropy_coeff=0.1, reduction="none")(batch)
+    whole = losses.ClipPPOLoss(actor, critic, entropy_coeff=0.1)(batch)
+    for key in ("loss_objective", "loss_critic", "loss_entropy"):
+        assert out[key].shape == batch.shape
+        torch.testing.assert_close(out[key].mean(), whole[key])
