@@ -71,9 +71,9 @@ def make_one(env_id: str, **kwargs: Any) -> gym.Env:
             _hear_mujoco()
         if env_id.startswith("dm_control/"):
             return _make_dm_control(env_id, **kwargs)
-        spec = gym.spec(env_id)  # every environment is reset before it is stepped: no wrapper need check that
-        spec = dataclasses.replace(spec, order_enforce=False)
-        return gym.make(spec, disable_env_checker=True, **kwargs)
+        spec = gym.registry.get(env_id)
+        known = env_id if spec is None else dataclasses.replace(spec, order_enforce=False)  # always reset before a step
+        return gym.make(known, disable_env_checker=True, **kwargs)
     except gym.error.UnregisteredEnv as error:
         if env_id.startswith("ALE/") and not any(known.startswith("ALE/") for known in gym.registry):
             raise UserError(f"environment '{env_id}' needs ale-py: pip install ale-py, then import ale_py") from error
