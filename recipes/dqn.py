@@ -65,7 +65,7 @@ class Args(run.RunArgs):
     """A row of metrics every so many frames."""
 
 
-PRESETS = {"CartPole-*": dict(total_frames=100_000, eval_every=10_000)}
+PRESETS = {"CartPole-*": dict(total_frames=100_000, eval_every=10_000, n_step=10, batch_size=256, tau=0.01)}
 
 
 def main(args: Args) -> None:
