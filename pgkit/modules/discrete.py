@@ -64,6 +64,11 @@ class Categorical(distributions.Categorical):
         probs = self.probs.expand(*sample_shape, *self.probs.shape)
         return (probs / torch.empty_like(probs).exponential_()).argmax(-1)
 
+    @property
+    def deterministic_sample(self) -> Tensor:
+        """The likeliest action, ``[*B]``; evaluation takes it."""
+        return self.mode
+
 
 class MaskedHead(nn.Module):
     """Logits ``[*B, n]`` of features and a boolean mask ``[*B, n]``: the least number there is where it is False."""
