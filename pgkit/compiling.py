@@ -60,7 +60,7 @@ def _mask_in_place(graph: GraphModule) -> None:
         x, masks, pick = put.args[:3]
         while pick.target is not aten.index.Tensor and _is_elementwise(pick):
             pick = pick.all_input_nodes[0]
-        if pick.args != (x, masks) or len(pick.users) != 1 or masks[0].meta["val"].dtype is not torch.bool:
+        if pick.args != (x, masks) or len(pick.users) != 1 or not _is_mask(masks, x):
             continue
         with graph.graph.inserting_before(pick):
             pick.replace_all_uses_with(graph.graph.call_function(aten.clone.default, (x,)))
@@ -70,6 +70,12 @@ def _mask_in_place(graph: GraphModule) -> None:
         graph.graph.erase_node(put)
         graph.graph.erase_node(pick)
     graph.recompile()
+
+
+def _is_mask(index: Sequence[Node | None], x: Node) -> bool:
+    """Whether an index is one boolean tensor of the shape of ``x``."""
+    mask = index[0].meta["val"] if len(index) == 1 and index[0] is not None else None
+    return mask is not None and mask.dtype is torch.bool and mask.shape == x.meta["val"].shape
 
 
 def _is_elementwise(node: Node) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import log
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -116,9 +116,9 @@ class SoftQLoss(QLoss):
 
     def draw(self) -> Tensor | None:
         """The critics that make this call's target, ``[subset]``; None: all."""
-        if self.subset in (None, self.num_critics):  # besides, inductor 2.13 cannot compile x[randperm(n)]
+        if self.subset is None or self.subset == self.num_critics:  # inductor 2.13 cannot compile x[randperm(n)]
             return None
-        return random_subset(self.num_critics, cast(int, self.subset), self.gamma.device)
+        return random_subset(self.num_critics, self.subset, self.gamma.device)
 
     def temperature_loss(self, action: Tensor, log_prob: Tensor) -> Tensor:
         """Unreduced ``[*B]`` loss of the temperature at actions ``[*B, actions]`` drawn now, ``log_prob [*B]``."""
