@@ -59,14 +59,17 @@ def _mask_in_place(graph: GraphModule) -> None:
     for put in graph.graph.find_nodes(op="call_function", target=aten.index_put_.default):
         x, masks, pick = put.args[:3]
         while pick.target is not aten.index.Tensor and _is_elementwise(pick):
-            pick = pick.all_input_nodes[0]
+            (pick,) = _with_dimensions(pick)
         if pick.args != (x, masks) or len(pick.users) != 1 or not _is_mask(masks, x):
             continue
         with graph.graph.inserting_before(pick):
-            pick.replace_all_uses_with(graph.graph.call_function(aten.clone.default, (x,)))
+            whole = graph.graph.call_function(aten.clone.default, (x,))
         with graph.graph.inserting_before(put):
             masked = graph.graph.call_function(aten.where.self, (masks[0], put.args[2], x))
-            put.replace_all_uses_with(graph.graph.call_function(aten.copy_.default, (x, masked)))
+            written = graph.graph.call_function(aten.copy_.default, (x, masked))
+        whole.meta["val"] = written.meta["val"] = x.meta["val"]
+        pick.replace_all_uses_with(whole)
+        put.replace_all_uses_with(written)
         graph.graph.erase_node(put)
         graph.graph.erase_node(pick)
     graph.recompile()
@@ -80,8 +83,13 @@ def _is_mask(index: Sequence[Node | None], x: Node) -> bool:
 
 def _is_elementwise(node: Node) -> bool:
     """Whether this is an elementwise operation on one tensor and numbers, and its result is used once."""
-    one = len(node.all_input_nodes) == len(node.users) == 1
+    one = len(_with_dimensions(node)) == len(node.users) == 1
     return one and torch.Tag.pointwise in getattr(node.target, "tags", ())
+
+
+def _with_dimensions(node: Node) -> list[Node]:
+    """The inputs of an operation that are more than a number."""
+    return [tensor for tensor in node.all_input_nodes if tensor.meta["val"].ndim]
 
 
 @contextmanager

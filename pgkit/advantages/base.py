@@ -47,7 +47,7 @@ class Advantage(TensorDictModuleBase):
 
     def estimate(self, value: Tensor, next_value: Tensor, rollout: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Advantage and value target ``[*B, T, 1]`` of the values :math:`V(s_t)` and :math:`V(s'_t)` of a rollout."""
-        raise NotImplementedError
+        raise NotImplementedError(f"{type(self).__name__} has no estimate(): return the advantage and the value target")
 
     @torch.no_grad()
     def forward(self, rollout: TensorDictBase) -> TensorDictBase:

@@ -42,11 +42,11 @@ class Loss(LossModule):
 
     def _reads(self) -> list[NestedKey]:
         """Every entry that ``forward`` reads; a key may come twice."""
-        raise NotImplementedError
+        raise NotImplementedError(f"{type(self).__name__} has no _reads(): return the keys that its forward reads")
 
     def _writes(self) -> list[NestedKey]:
         """Entries of ``forward``'s result."""
-        raise NotImplementedError
+        raise NotImplementedError(f"{type(self).__name__} has no _writes(): return the keys of its forward's result")
 
     @property
     def in_keys(self) -> list[NestedKey]:

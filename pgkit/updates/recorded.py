@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from logging import getLogger
 from typing import Any, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from torch.fx import GraphModule
+from torch._ops import OpOverload
+from torch.fx import GraphModule, Node
 
 from pgkit.compiling import compile_record, record
 from pgkit.updates.decisions import Decisions
@@ -60,6 +62,7 @@ def recorded(step: Step, held: Sequence[Tensor], data: TensorDictBase, index: Te
                 return result
             torch.set_rng_state(random)
         if len(graphs) < _MOST_GRAPHS:
+            getLogger("pgkit").info("compiling the update for another branch of the loss, once: a few seconds")
             graphs.insert(0, _graph(step, held, data, index)[0])
         return step(data, index)
 
@@ -96,7 +99,7 @@ def _graph(
         constant = getattr(graph, str(node.target))
         if isinstance(constant, Tensor) and constant.untyped_storage().data_ptr() in memory:
             raise RuntimeError(f"tracing: '{node.target}' shares memory with a parameter or buffer without being it")
-        if any(user.args[0] is node and torch.Tag.inplace in user.target.tags for user in node.users):
+        if _is_written(node):
             raise RuntimeError(f"tracing: the step writes to '{node.target}', which is none of what it holds")
     fixed = [tensor.detach() for tensor in held]
     code = compile_record(graph, [*fixed, *(data[key] for key in keys), index])
@@ -114,6 +117,17 @@ def _graph(
         return metrics, grads
 
     return run, decisions
+
+
+def _is_written(node: Node) -> bool:
+    """Whether an operation of the graph changes this tensor in place, or a view of it."""
+    for user in node.users:
+        operation = user.target
+        if isinstance(operation, OpOverload) and user.args[:1] == (node,):
+            inplace = torch.Tag.inplace in operation.tags
+            if inplace or (operation.is_view and _is_written(user)):
+                return True
+    return False
 
 
 def _undone(tensors: Sequence[Tensor], function: Callable[[], Any]) -> Any:
