@@ -63,6 +63,9 @@ def parser() -> Parser:
     command.add_argument(
         "-o", "--out", type=Path, help="image file (default: curve.png in RUN_DIR, or curves.png for several)"
     )
+    command.add_argument(
+        "--x", choices=["frames", "wall"], default="frames", help="axis: frames, or minutes of training"
+    )
     command.set_defaults(command=plot_runs)
     return top
 
@@ -133,5 +136,5 @@ def plot_runs(args: argparse.Namespace) -> None:
     from pgkit import run
 
     out = args.out or (args.run_dirs[0] / "curve.png" if len(args.run_dirs) == 1 else Path("curves.png"))
-    run.plot(args.run_dirs, out)
+    run.plot(args.run_dirs, out, args.x)
     print(f"wrote {out}")

@@ -18,7 +18,7 @@ def read_csv(path: Path) -> tuple[list[str], list[dict[str, str]]]:
         return list(reader.fieldnames or []), list(reader)
 
 
-def column(rows: list[dict[str, str]], name: str) -> list[tuple[int, float]]:
+def column(rows: list[dict[str, str]], name: str) -> list[tuple[float, float]]:
     """``(frames, value)`` of every row in which ``name`` has a value."""
     return [(int(row["frames"]), float(row[name])) for row in rows if row.get(name)]
 

@@ -1,46 +1,53 @@
 """Learning curves of one run or of many, from their ``metrics.csv``."""
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from pgkit.errors import UserError
 from pgkit.run.directory import read_config
 from pgkit.run.metrics import column, read_csv
+from pgkit.run.settings import RunArgs
 
-Curve = list[tuple[int, float]]
+Curve = list[tuple[float, float]]
 TRAINING, EVALUATION = "rollout/ep_rew_mean", "eval/mean_reward"
+# settings in which seeds of one experiment may differ; the rest of every recipe's, and num_envs, change what is learned
+_INCIDENTAL = {field.name for field in fields(RunArgs)} - {"num_envs"}
 
 
-def plot(run_dirs: Sequence[str | Path], out: str | Path) -> None:
-    """Draw return against frames to ``out`` (png, pdf, svg by its ending).
+def plot(run_dirs: Sequence[str | Path], out: str | Path, x: Literal["frames", "wall"] = "frames") -> None:
+    """Draw return against frames, or against minutes of training, to ``out`` (png, pdf, svg by its ending).
 
-    One panel an env. Runs of the same env and recipe are seeds of one experiment: the line is their mean, the
-    band one standard deviation either side. Lines are training returns, dots are evaluations.
+    One panel an env. Runs of the same env, recipe and settings are seeds of one experiment: the line is their mean,
+    the band one standard deviation either side. Lines are training returns, dots are evaluations. Experiments of one
+    recipe are told apart by the settings in which they differ.
     """
     from matplotlib.figure import Figure
 
-    groups: dict[str, dict[str, list[Path]]] = defaultdict(lambda: defaultdict(list))
-    for run_dir in map(Path, run_dirs):
-        config = read_config(run_dir)
+    panels: dict[str, dict[str, list[Path]]] = defaultdict(dict)
+    configs = {run_dir: read_config(run_dir) for run_dir in map(Path, run_dirs)}
+    for run_dir, label in _labels(configs).items():
         if not (run_dir / "metrics.csv").is_file():
             raise UserError(f"{run_dir} has no metrics.csv: nothing was logged there yet")
-        groups[config["settings"]["env_id"]][config["recipe"]].append(run_dir)
-    figure = Figure(figsize=(6.4 * len(groups), 4.2), layout="constrained")
-    for axes, (env_id, recipes) in zip(figure.subplots(1, len(groups), squeeze=False)[0], groups.items(), strict=True):
-        for number, (recipe, members) in enumerate(recipes.items()):
+        panels[configs[run_dir]["settings"]["env_id"]].setdefault(label, []).append(run_dir)
+    figure = Figure(figsize=(6.4 * len(panels), 4.2), layout="constrained")
+    for axes, (env_id, experiments) in zip(
+        figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True
+    ):
+        for number, (label, members) in enumerate(experiments.items()):
             rows = [read_csv(member / "metrics.csv")[1] for member in members]
             seeds = f" ({len(rows)} seeds)" if len(rows) > 1 else ""
             colour = f"C{number}"
-            _draw(axes, [column(r, TRAINING) for r in rows], f"{recipe} training{seeds}", color=colour)
+            _draw(axes, [_curve(r, TRAINING, x) for r in rows], f"{label} training{seeds}", color=colour)
             _draw(
-                axes, [column(r, EVALUATION) for r in rows], f"{recipe} evaluation{seeds}",
+                axes, [_curve(r, EVALUATION, x) for r in rows], f"{label} evaluation{seeds}",
                 color=colour, linestyle="--", marker="o", markersize=4, alpha=0.8,
             )  # fmt: skip
-        axes.set(title=env_id, xlabel="frames", ylabel="return of an episode")
+        axes.set(title=env_id, xlabel="frames" if x == "frames" else "minutes", ylabel="return of an episode")
         axes.xaxis.set_major_formatter(_frames)
         axes.grid(alpha=0.3)
         if axes.get_legend_handles_labels()[0]:
@@ -49,6 +56,32 @@ def plot(run_dirs: Sequence[str | Path], out: str | Path) -> None:
         figure.savefig(out, dpi=150)
     except (OSError, ValueError) as error:
         raise UserError(f"cannot write {out}: {error}") from error
+
+
+def _labels(configs: Mapping[Path, Mapping[str, Any]]) -> dict[Path, str]:
+    """Recipe of each run, and the settings in which it differs from runs of the same recipe and env."""
+    labels = {}
+    for run_dir, config in configs.items():
+        settings = config["settings"]
+        peers = [
+            other["settings"]
+            for other in configs.values()
+            if other["recipe"] == config["recipe"] and other["settings"]["env_id"] == settings["env_id"]
+        ]
+        differing = [
+            f"{name}={value}"
+            for name, value in settings.items()
+            if name not in _INCIDENTAL and any(peer.get(name) != value for peer in peers)
+        ]
+        labels[run_dir] = " ".join([config["recipe"], *differing])
+    return labels
+
+
+def _curve(rows: list[dict[str, str]], name: str, x: str) -> Curve:
+    """Points of a metric against frames or minutes."""
+    if x == "frames":
+        return column(rows, name)
+    return [(float(row["time/wall_s"]) / 60, float(row[name])) for row in rows if row.get(name)]
 
 
 def mean_and_band(curves: Sequence[Curve]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

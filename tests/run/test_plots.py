@@ -17,9 +17,9 @@ def test_mean_and_band_are_taken_where_all_curves_have_values():
     np.testing.assert_array_equal(band, [10, 10])
 
 
-def saved_run(path: Path, env_id: str, text: str) -> Path:
+def saved_run(path: Path, env_id: str, text: str, **settings: object) -> Path:
     path.mkdir()
-    (path / "config.json").write_text(json.dumps({"recipe": "ppo", "settings": {"env_id": env_id}}))
+    (path / "config.json").write_text(json.dumps({"recipe": "ppo", "settings": {"env_id": env_id, **settings}}))
     (path / "metrics.csv").write_text(text)
     return path
 
@@ -29,6 +29,16 @@ def test_several_runs_and_envs_make_one_figure(tmp_path: Path):
     runs = [saved_run(tmp_path / name, env, text) for name, env in (("a", "X-v0"), ("b", "X-v0"), ("c", "Y-v0"))]
     run.plot(runs, tmp_path / "out.svg")
     assert (tmp_path / "out.svg").read_text().startswith("<?xml")
+
+
+def test_runs_are_averaged_over_seeds_and_told_apart_by_settings(tmp_path: Path):
+    text = "frames,time/wall_s,rollout/ep_rew_mean\n10,60,1.0\n20,120,2.0\n"
+    agents = [("a", {"seed": 1, "clip": 0.2}), ("b", {"seed": 2, "clip": 0.2}), ("c", {"seed": 1, "clip": 0.1})]
+    runs = [saved_run(tmp_path / name, "X-v0", text, **settings) for name, settings in agents]
+    run.plot(runs, tmp_path / "out.svg", x="wall")
+    drawn = (tmp_path / "out.svg").read_text()
+    labels = ("ppo clip=0.2 training (2 seeds)", "ppo clip=0.1 training", "minutes")
+    assert all(f"<!-- {label} -->" in drawn for label in labels) and "<!-- frames -->" not in drawn
 
 
 def test_a_run_with_nothing_in_it_yet_still_plots(tmp_path: Path):
