@@ -30,7 +30,7 @@ def plot(run_dirs: Sequence[str | Path], out: str | Path, x: Literal["frames", "
 
     panels: dict[str, dict[str, list[Path]]] = defaultdict(dict)
     configs = {run_dir: read_config(run_dir) for run_dir in map(Path, run_dirs)}
-    for run_dir, label in _labels(configs).items():
+    for run_dir, label in labels(configs).items():
         if not (run_dir / "metrics.csv").is_file():
             raise UserError(f"{run_dir} has no metrics.csv: nothing was logged there yet")
         panels[configs[run_dir]["settings"]["env_id"]].setdefault(label, []).append(run_dir)
@@ -58,9 +58,9 @@ def plot(run_dirs: Sequence[str | Path], out: str | Path, x: Literal["frames", "
         raise UserError(f"cannot write {out}: {error}") from error
 
 
-def _labels(configs: Mapping[Path, Mapping[str, Any]]) -> dict[Path, str]:
+def labels(configs: Mapping[Path, Mapping[str, Any]]) -> dict[Path, str]:
     """Recipe of each run, and the settings in which it differs from runs of the same recipe and env."""
-    labels = {}
+    names = {}
     for run_dir, config in configs.items():
         settings = config["settings"]
         peers = [
@@ -73,8 +73,8 @@ def _labels(configs: Mapping[Path, Mapping[str, Any]]) -> dict[Path, str]:
             for name, value in settings.items()
             if name not in _INCIDENTAL and any(peer.get(name) != value for peer in peers)
         ]
-        labels[run_dir] = " ".join([config["recipe"], *differing])
-    return labels
+        names[run_dir] = " ".join([config["recipe"], *differing])
+    return names
 
 
 def _curve(rows: list[dict[str, str]], name: str, x: str) -> Curve:
