@@ -3,8 +3,8 @@
     python tests/benchmarks/returns.py --runs RUN_DIR ... --speed RUN_DIR ... --out returns.png
 
 Runs that differ in nothing but their seed are one experiment. The interquartile mean weighs the middle half of the
-seeds; its interval is the 95% bootstrap over seeds (Agarwal et al., 2021, https://arxiv.org/abs/2108.13264). Minutes are
-frames by the speed of a short run of the same experiment, alone on the machine: `--speed` has one of each.
+seeds; its interval is the 95% bootstrap over seeds (Agarwal et al., 2021, https://arxiv.org/abs/2108.13264). Minutes
+are frames by the speed of a short run of the same experiment, alone on the machine: `--speed` has one of each.
 """
 
 import itertools
