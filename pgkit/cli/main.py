@@ -1,6 +1,7 @@
 """``pgkit ls / cp / run / eval / plot``. Heavy imports wait until a command needs them."""
 
 import argparse
+import os
 import shutil
 import sys
 import types
@@ -98,6 +99,8 @@ def copy_recipe(args: argparse.Namespace) -> None:
     source, target = recipes.find(args.recipe), args.file
     if target.is_dir():
         target = target / source.name
+    if target.suffix != ".py":
+        raise UserError(f"{target} is no name for a recipe: give one that ends in .py")
     if target.exists():
         raise UserError(f"{target} exists and is not overwritten; give another name")
     if not target.parent.is_dir():
@@ -111,7 +114,7 @@ def run_recipe(args: argparse.Namespace) -> None:
     path = recipes.find(args.recipe)
     variant = ["--variant", args.recipe] if args.recipe in recipes.variants() else []
     sys.argv = [args.recipe, *variant, *args.flags]
-    sys.path.insert(0, str(path.resolve().parent))
+    sys.path[:0] = [str(path.resolve().parent), os.getcwd()]  # --env-id module:Id finds modules here
     script = types.ModuleType("__main__")  # as runpy.run_path does it, but argv[0] stays what the user typed
     script.__file__ = str(path.resolve())
     sys.modules["__main__"] = script
@@ -121,6 +124,7 @@ def run_recipe(args: argparse.Namespace) -> None:
 def evaluate_run(args: argparse.Namespace) -> None:
     from pgkit import run
 
+    sys.path.insert(0, os.getcwd())
     policy = run.load_policy(args.run_dir, args.which)
     env = policy.make_env(num_envs=min(args.episodes, 10), seed=args.seed)
     try:

@@ -53,6 +53,8 @@ def find(recipe: str) -> Path:
         if recipe in named:
             return recipes_dir() / f"{named[recipe][0]}.py"
         known = sorted([*known, *named])
+        if Path(f"{recipe}.py").is_file():
+            raise UserError(f"no recipe named {recipe}; the file here is {recipe}.py")
         close = ", ".join(difflib.get_close_matches(recipe, known, cutoff=0.3) or known)
         raise UserError(f"no recipe named {recipe}; nearest: {close} (pgkit ls lists all; a file ends in .py)")
     return recipes_dir() / f"{recipe}.py"

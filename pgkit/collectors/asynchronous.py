@@ -12,7 +12,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from pgkit.collectors.policy import example, output_keys
+from pgkit.collectors.policy import check_env, example, output_keys
 from pgkit.collectors.stepping import Arrays, as_rollout
 from pgkit.collectors.workers import Workers, shares
 from pgkit.compiling import worth_compiling
@@ -45,7 +45,8 @@ class AsyncCollector:
         compile: ``on``, ``off`` or ``auto``, for the policy.
 
     Raises:
-        UserError: sizes that do not fit, or an actor that was built for another environment.
+        UserError: sizes that do not fit, an environment of TorchRL's own (transforms included), or an actor that was
+            built for another environment.
     """
 
     def __init__(
@@ -61,6 +62,7 @@ class AsyncCollector:
         delay: int = 0,
         compile: str = "auto",
     ) -> None:
+        check_env(env, self)
         cuts = shares(env)
         self._bounds = [cuts[i : i + 2] for i in range(env.workers)] if per_worker else [cuts]
         columns = {bounds[-1] - bounds[0] for bounds in self._bounds}

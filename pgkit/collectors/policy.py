@@ -91,6 +91,15 @@ def random_actions(spec: TensorSpec, outputs: dict[NestedKey, Tensor]) -> Act:
     return act
 
 
+def check_env(env: Any, collector: Any) -> None:
+    """A UserError for an environment whose arrays a collector of pgkit cannot step by itself."""
+    if not isinstance(env, VectorEnv):
+        raise UserError(
+            f"{type(collector).__name__} steps what envs.make gives, a {type(env).__name__} is none of that: use "
+            "collectors.TorchRLCollector"
+        )
+
+
 def example(env: VectorEnv, actor: TensorDictModuleBase) -> tuple[Tensor, ...]:
     """The actor's outputs for observations of zeros, checked against the environment's action spec."""
     entries, spec = env.observation_spec.zero(), env.action_spec
@@ -107,7 +116,7 @@ def example(env: VectorEnv, actor: TensorDictModuleBase) -> tuple[Tensor, ...]:
             out = actor(data)
         except RuntimeError as error:
             shapes = ", ".join(str(tuple(x.shape[1:])) for x in entries.values())
-            reason = str(error.__cause__ or error).strip().splitlines()[-1]
+            reason = str(error).strip().partition("\n")[0]
             raise UserError(f"the actor cannot read observations of shape {shapes}; {misfit} [{reason}]") from error
     action = out["action"]
     if action.shape != spec.shape or action.dtype.is_floating_point != spec.dtype.is_floating_point:

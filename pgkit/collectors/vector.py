@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
-from pgkit.collectors.policy import Act, example, output_keys, random_actions, trace
+from pgkit.collectors.policy import Act, check_env, example, output_keys, random_actions, trace
 from pgkit.collectors.stepping import allocate, as_rollout, fill
 from pgkit.collectors.workers import Workers
 from pgkit.compiling import worth_compiling
@@ -40,7 +40,8 @@ class VectorCollector:
         compile: ``on``, ``off``, or ``auto``: where a C++ compiler is there and ``total_frames`` is large enough.
 
     Raises:
-        UserError: sizes that do not fit, or an actor that was built for another environment.
+        UserError: sizes that do not fit, an environment of TorchRL's own (transforms included), or an actor that was
+            built for another environment.
     """
 
     def __init__(
@@ -53,6 +54,7 @@ class VectorCollector:
         init_random_frames: int = 0,
         compile: str = "auto",
     ) -> None:
+        check_env(env, self)
         if frames_per_batch < 1 or frames_per_batch % env.num_envs:
             raise UserError(
                 f"frames_per_batch={frames_per_batch} is not a multiple of the {env.num_envs} environments: each takes "

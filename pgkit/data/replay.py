@@ -53,10 +53,12 @@ class ReplayBuffer:
         seed: int | None = None,
     ) -> None:
         self.columns = env.batch_size.numel()
-        if capacity < self.columns or n_steps < 1:
+        if n_steps < 1:
+            raise UserError(f"n_steps={n_steps}: a return has at least one step")
+        if capacity < self.columns:
             raise UserError(
-                f"a replay buffer of capacity {capacity} with n_steps={n_steps} does not hold one frame of each of the "
-                f"{self.columns} environments: raise the capacity"
+                f"a replay buffer of capacity {capacity} does not hold one frame of each of the {self.columns} "
+                "environments: raise the capacity"
             )
         self.capacity, self.n_steps, self.sampler = capacity, n_steps, sampler
         self.rows = (-(-capacity // self.columns) + 1) * self.columns  # one more step: the newest next observations

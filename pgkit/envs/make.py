@@ -76,13 +76,35 @@ def make_one(env_id: str, **kwargs: Any) -> gym.Env:
         return gym.make(known, disable_env_checker=True, **kwargs)
     except gym.error.UnregisteredEnv as error:
         if env_id.startswith("ALE/") and not any(known.startswith("ALE/") for known in gym.registry):
-            raise UserError(f"environment '{env_id}' needs ale-py: pip install ale-py, then import ale_py") from error
-        raise _unknown(env_id, list(gym.registry)) from error
+            raise UserError(
+                f"environment '{env_id}' needs ale-py: pip install ale-py, then give its id as ale_py:{env_id}"
+            ) from error
+        raise _unknown(env_id, [known for known in gym.registry if not _supported(known)]) from error
     except (gym.error.DependencyNotInstalled, ImportError) as error:
-        reason = str(error).splitlines()[0].rstrip(".")
-        raise UserError(
-            f"environment '{env_id}' needs a package that is not installed ({reason}): pip install \"{_extra(env_id)}\""
-        ) from error
+        raise _not_installed(env_id, error) from error
+    except gym.error.Error as error:
+        raise UserError(f"environment '{env_id}': {str(error).splitlines()[0]}") from error
+
+
+def _not_installed(env_id: str, error: Exception) -> UserError:
+    module, colon, _ = env_id.partition(":")
+    if colon:
+        return UserError(f"environment '{env_id}': no module '{module}' to import, neither here nor installed")
+    if newest := _supported(env_id):
+        return UserError(f"environment '{env_id}' is one of Gymnasium's former ones: use {newest}")
+    reason = str(error).splitlines()[0].rstrip(".")
+    return UserError(
+        f"environment '{env_id}' needs a package that is not installed ({reason}): pip install \"{_extra(env_id)}\""
+    )
+
+
+def _supported(env_id: str) -> str | None:
+    """The newest version of an environment, if MuJoCo's version 2 or 3 is asked for; those live in another package."""
+    name, _, version = env_id.rpartition("-v")
+    if version not in ("2", "3"):
+        return None
+    newest = max((spec.version or 0 for spec in gym.registry.values() if spec.name == name), default=0)
+    return f"{name}-v{newest}" if newest > 3 else None
 
 
 def _entry_point(env_id: str) -> str:

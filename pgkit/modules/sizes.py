@@ -38,7 +38,10 @@ def box_action(env: EnvBase, needs_bounds: bool = False) -> TensorSpec:
     """Spec of one continuous action; a ``UserError`` names the right builder otherwise."""
     spec = env.action_spec_unbatched
     if not spec.dtype.is_floating_point:
-        raise UserError(f"the action space is discrete ({spec.__class__.__name__}): use modules.categorical_actor")
+        raise UserError(
+            f"the action space is discrete ({spec.__class__.__name__}): use modules.categorical_actor and "
+            "modules.discrete_q_value; the recipes for it are discrete_sac, dqn, rainbow and ppo"
+        )
     if needs_bounds and not isinstance(spec, Bounded):
         raise UserError("the action space has no bounds to squash into: use modules.gaussian_actor, or bound the Box")
     return spec

@@ -1,6 +1,7 @@
 """Checkpoints: everything that a resumed run needs to go on bit for bit, each file replaced in one step."""
 
 import os
+import pickle
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -33,7 +34,10 @@ def load(path: Path) -> Any:
     """What ``save`` wrote, on the CPU. It unpickles: open only run directories that you trust."""
     if not path.is_file():
         raise UserError(f"{path.parent.parent} has no checkpoint {path.name}: nothing was saved there yet")
-    return torch.load(path, map_location="cpu", weights_only=False)
+    try:
+        return torch.load(path, map_location="cpu", weights_only=False)
+    except (RuntimeError, EOFError, pickle.UnpicklingError) as error:
+        raise UserError(f"{path} is damaged: {str(error).splitlines()[0]}") from error
 
 
 def restore(tracked: dict[str, Stateful], states: dict[str, Any], where: Path) -> None:
@@ -47,5 +51,8 @@ def restore(tracked: dict[str, Stateful], states: dict[str, Any], where: Path) -
         try:
             owner.load_state_dict(states[name])
         except (RuntimeError, KeyError) as error:
-            reason = " ".join(str(error).split())[:200]
-            raise UserError(f"{where}: the state of {name} does not fit what the recipe built ({reason})") from error
+            reason = str(error).strip().splitlines()[-1].strip()
+            raise UserError(
+                f"{where}: the state of {name} does not fit what the recipe built: networks and optimizers keep their "
+                f"settings on a resume ({reason})"
+            ) from error

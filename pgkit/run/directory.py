@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from pgkit.errors import UserError
-from pgkit.run.settings import RunArgs
+from pgkit.run.settings import RunArgs, read_json
 
 PACKAGES = ("pgkit", "torch", "torchrl", "tensordict", "numpy", "gymnasium", "mujoco", "dm-control", "shimmy")
 
@@ -49,7 +49,10 @@ def write_config(path: Path, args: RunArgs, recipe: str, resumed_at: list[int]) 
         "git_revision": git_revision(),
         "resumed_at": resumed_at,
     }
-    path.mkdir(parents=True, exist_ok=True)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"--run-dir {path} cannot be made: {error.strerror}") from error
     if not resumed_at:
         try:
             (path / "config.json").touch(exist_ok=False)
@@ -62,7 +65,7 @@ def read_config(path: Path) -> dict[str, Any]:
     """``config.json`` of a run directory; a UserError if there is none."""
     if not (path / "config.json").is_file():
         raise UserError(f"{path} is not a run directory: it has no config.json")
-    return json.loads((path / "config.json").read_text())
+    return read_json(path / "config.json")
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:

@@ -40,7 +40,8 @@ def plot(run_dirs: Sequence[str | Path], out: str | Path, x: Literal["frames", "
     ):
         for number, (label, members) in enumerate(experiments.items()):
             rows = [read_csv(member / "metrics.csv")[1] for member in members]
-            seeds = f" ({len(rows)} seeds)" if len(rows) > 1 else ""
+            distinct = {configs[member]["settings"].get("seed") for member in members}
+            seeds = f" ({len(rows)} {'seeds' if len(distinct) == len(rows) else 'runs'})" if len(rows) > 1 else ""
             colour = f"C{number}"
             _draw(axes, [_curve(r, TRAINING, x) for r in rows], f"{label} training{seeds}", color=colour)
             _draw(
@@ -59,22 +60,28 @@ def plot(run_dirs: Sequence[str | Path], out: str | Path, x: Literal["frames", "
 
 
 def labels(configs: Mapping[Path, Mapping[str, Any]]) -> dict[Path, str]:
-    """Recipe of each run, and the settings in which it differs from runs of the same recipe and env."""
-    names = {}
+    """Recipe of each run (its file, where that is a copy) and the settings in which it differs from its like."""
+    names, recipes = {}, {run_dir: _recipe(config) for run_dir, config in configs.items()}
     for run_dir, config in configs.items():
         settings = config["settings"]
         peers = [
             other["settings"]
-            for other in configs.values()
-            if other["recipe"] == config["recipe"] and other["settings"]["env_id"] == settings["env_id"]
+            for path, other in configs.items()
+            if recipes[path] == recipes[run_dir] and other["settings"]["env_id"] == settings["env_id"]
         ]
         differing = [
             f"{name}={value}"
             for name, value in settings.items()
             if name not in _INCIDENTAL and any(peer.get(name) != value for peer in peers)
         ]
-        names[run_dir] = " ".join([config["recipe"], *differing])
+        names[run_dir] = " ".join([recipes[run_dir], *differing])
     return names
+
+
+def _recipe(config: Mapping[str, Any]) -> str:
+    command = Path(config.get("command", [""])[0])
+    same = command.suffix != ".py" or command.stem == config["recipe"]
+    return config["recipe"] if same else f"{config['recipe']} ({command.name})"
 
 
 def _curve(rows: list[dict[str, str]], name: str, x: str) -> Curve:
@@ -101,6 +108,8 @@ def _draw(axes: Any, curves: list[Curve], label: str, **style: Any) -> None:
     if not curves:
         return
     frames, mean, deviation = mean_and_band(curves)
+    if not len(frames):
+        return
     axes.plot(frames, mean, label=label, **style)
     if len(curves) > 1:
         axes.fill_between(frames, mean - deviation, mean + deviation, color=style["color"], alpha=0.15, linewidth=0)

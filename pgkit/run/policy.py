@@ -86,8 +86,11 @@ def load_policy(run_dir: str | Path, which: Which = "best") -> Policy:
     """
     run_dir = Path(run_dir)
     read_config(run_dir)
-    saved = checkpoint.load(run_dir / "checkpoints" / f"{which}.pt")
-    policy = Policy(**checkpoint.load(run_dir / "checkpoints" / "policy.pt"), frames=saved["frames"])
+    folder = run_dir / "checkpoints"
+    if which == "best" and not (folder / "best.pt").exists() and (folder / "latest.pt").exists():
+        raise UserError(f"{run_dir} has no evaluation yet, so no best policy: ask for the latest (--which latest)")
+    saved = checkpoint.load(folder / f"{which}.pt")
+    policy = Policy(**checkpoint.load(folder / "policy.pt"), frames=saved["frames"])
     policy.actor.load_state_dict(saved["states"]["policy"])
     policy.actor.eval()
     return policy

@@ -1,13 +1,17 @@
 """The flags that every recipe has, and the way from the command line to a recipe's ``main``."""
 
 import argparse
+import contextlib
 import dataclasses
+import io
+import itertools
 import json
 import logging
+import math
 import shlex
 import sys
 import typing
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -46,6 +50,18 @@ class RunArgs:
     """Print how the agent is wired (who writes and who reads each entry), and end before training."""
 
 
+# what no run can have, for the settings that a recipe may have under these names: (least, most)
+_BOUNDS: dict[str, tuple[float, float]] = {
+    **dict.fromkeys(("total_frames", "num_envs", "workers", "eval_episodes", "threads"), (1, math.inf)),
+    **dict.fromkeys(("steps", "epochs", "minibatch_size", "batch_size", "n_step", "buffer_size"), (1, math.inf)),
+    **dict.fromkeys(("actor_delay", "action_repeat", "log_every", "num_critics", "atoms", "bins"), (1, math.inf)),
+    **dict.fromkeys(("hidden", "critic_hidden"), (1, math.inf)),
+    **dict.fromkeys(("seed", "eval_every", "random_frames", "updates_per_step", "max_grad_norm"), (0, math.inf)),
+    **dict.fromkeys(("learning_rate", "q_learning_rate", "alpha_learning_rate", "clip_epsilon"), (0, math.inf)),
+    **dict.fromkeys(("gamma", "lmbda", "tau", "dropout"), (0, 1)),
+    "alpha_init": (1e-8, math.inf),
+}
+
 A = TypeVar("A", bound=RunArgs)
 Presets = Mapping[str, Mapping[str, Any]]
 
@@ -80,8 +96,6 @@ def parse(args_class: type[A], presets: Presets, argv: Sequence[str], variants: 
 
     A resumed run's settings take the place of the first three.
     """
-    import tyro
-
     peek = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     peek.add_argument("--env-id", "--env_id", nargs="?")
     peek.add_argument("--resume", nargs="?", type=Path)
@@ -95,7 +109,7 @@ def parse(args_class: type[A], presets: Presets, argv: Sequence[str], variants: 
     else:
         pattern, preset = first_match(presets, given.env_id or defaults.env_id)
     base = dataclasses.replace(defaults, **{**variant, **preset})
-    args = tyro.cli(args_class, default=base, args=list(argv), prog=_program(), description=main_doc(args_class))
+    args = _flags(args_class, base, given.env_id or base.env_id, list(_whole_numbers(args_class, argv)))
     if given.resume:
         _check_resumed(base, args)
     else:
@@ -103,6 +117,41 @@ def parse(args_class: type[A], presets: Presets, argv: Sequence[str], variants: 
             if shown := [f"{key}={value}" for key, value in chosen.items() if getattr(args, key) == value]:
                 print(f"{title}: {' '.join(shown)}")
     return args
+
+
+def _flags(args_class: type[A], base: A, env_id: str, argv: Sequence[str]) -> A:
+    """The flags over ``base``; a UserError says in one line what tyro says in a box."""
+    import tyro
+
+    about = f"{main_doc(args_class)} The defaults shown are those for --env-id {env_id}."
+    box = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(box):
+            return tyro.cli(args_class, default=base, args=argv, prog=_program(), description=about)
+    except SystemExit as end:
+        if not end.code:
+            raise
+    lines = [line.strip("│ ") for line in box.getvalue().splitlines()[1:]]  # without the title
+    parts = [list(part) for is_text, part in itertools.groupby(lines, lambda line: bool(line.strip("─-╰╯"))) if is_text]
+    message = " ".join(parts[0])
+    if message.startswith("Unrecognized"):
+        similar = [line.split()[0] for part in parts[1:] for line in part if line.startswith("--")]
+        if argv and not argv[0].startswith("-"):
+            message += f"; did you mean --env-id {argv[0]}?"
+        elif similar:
+            message += f"; the nearest are {', '.join(similar)}"
+    raise UserError(f"{message} (see {_program()} --help)")
+
+
+def _whole_numbers(args_class: type[RunArgs], argv: Sequence[str]) -> Iterator[str]:
+    """The flags, with ``1e6`` written out where a flag takes whole numbers."""
+    hints = typing.get_type_hints(args_class)
+    for before, text in zip(["", *argv], argv, strict=False):
+        kinds = typing.get_args(hint := hints.get(before.removeprefix("--").replace("-", "_"))) or (hint,)
+        if int in kinds and float not in kinds and "e" in text.lower():
+            with contextlib.suppress(ValueError):
+                text = f"{float(text):.0f}" if float(text).is_integer() else text
+        yield text
 
 
 def _variant(variants: Presets, name: str | None) -> tuple[str | None, Mapping[str, Any]]:
@@ -113,12 +162,12 @@ def _variant(variants: Presets, name: str | None) -> tuple[str | None, Mapping[s
 
 def check(args: RunArgs) -> None:
     """A UserError for a number that no run can have."""
-    for name in ("total_frames", "num_envs", "workers", "eval_episodes", "threads"):
-        if getattr(args, name) < 1:
-            raise UserError(f"--{name.replace('_', '-')} {getattr(args, name)}: give at least 1")
-    for name in ("eval_every", "seed"):
-        if getattr(args, name) < 0:
-            raise UserError(f"--{name.replace('_', '-')} {getattr(args, name)}: give at least 0")
+    for name, (least, most) in _BOUNDS.items():
+        value = getattr(args, name, None)
+        for number in value if isinstance(value, tuple) else (value,):
+            if number is not None and not least <= number <= most:
+                bound = f"at least {least:g}" if number < least else f"at most {most:g}"
+                raise UserError(f"--{name.replace('_', '-')} {number}: give {bound}")
 
 
 def main_doc(args_class: type[RunArgs]) -> str:
@@ -147,7 +196,7 @@ def _saved_settings(args_class: type[RunArgs], run_dir: Path) -> dict[str, Any]:
     path = run_dir / "config.json"
     if not path.is_file():
         raise UserError(f"--resume {run_dir}: no config.json there, so it is not a run directory")
-    config, hints = json.loads(path.read_text()), typing.get_type_hints(args_class)
+    config, hints = read_json(path), typing.get_type_hints(args_class)
     saved = config["settings"]
     if unknown := saved.keys() - hints.keys():
         names = ", ".join(sorted(unknown))
@@ -164,7 +213,18 @@ def _typed(value: Any, hint: Any) -> Any:
     return tuple(value) if is_tuple else value
 
 
+def read_json(path: Path) -> dict[str, Any]:
+    """A run's JSON file; a UserError if it is damaged."""
+    try:
+        return json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path} cannot be read: {error}") from error
+
+
 def _check_resumed(saved: RunArgs, args: RunArgs) -> None:
     for name, why in {"env_id": "that run trains on", "run_dir": "a resumed run goes on in"}.items():
         if getattr(args, name) != getattr(saved, name):
             raise UserError(f"--{name.replace('_', '-')} {getattr(args, name)}: {why} {getattr(saved, name)}")
+    if getattr(args, "anneal", False) and args.total_frames != saved.total_frames:
+        frames = f"{args.total_frames:,}, no longer {saved.total_frames:,} frames"
+        print(f"the learning rate anneals to zero at {frames}: it jumps where the run goes on")

@@ -42,7 +42,7 @@ class OffPolicyUpdate:
         compile: ``on``, ``off``, or ``auto`` (compile where at least 3,000 steps are expected).
 
     Raises:
-        UserError: ``learning_starts`` is below ``batch_size``, or the buffer is too small for one batch.
+        UserError: ``learning_starts`` is below ``batch_size``, or above what the buffer can keep or ``total_frames``.
     """
 
     def __init__(
@@ -66,6 +66,18 @@ class OffPolicyUpdate:
                 f"batch_size={batch_size} is above the learning_starts={learning_starts} frames stored at the first "
                 "update: raise learning_starts or lower batch_size"
             )
+        own = isinstance(buffer, ReplayBuffer)
+        capacity = buffer.capacity if own else buffer.storage.max_size
+        if capacity < learning_starts:
+            raise UserError(
+                f"the replay keeps {capacity:,} frames and updates begin at learning_starts={learning_starts:,}: raise "
+                "its capacity (--buffer-size) or lower learning_starts (--random-frames, --batch-size)"
+            )
+        if total_frames is not None and total_frames < learning_starts:
+            raise UserError(
+                f"total_frames={total_frames:,} end before updates begin at learning_starts={learning_starts:,}: raise "
+                "the first or lower the second (--random-frames, --batch-size)"
+            )
         self.loss, self.buffer, self.optimizer = loss, buffer, optimizer
         self.batch_size, self.updates_per_step, self.actor_delay = batch_size, updates_per_step, actor_delay
         self.delay_targets = delay_targets
@@ -75,7 +87,6 @@ class OffPolicyUpdate:
         self._due = 0.0
         self._batch: TensorDictBase | None = None
         self._average = averaging(loss, tau)
-        own = isinstance(buffer, ReplayBuffer)
         self._batches: Batches = (
             OwnBatches(buffer, loss, batch_size) if own else TorchRLBatches(buffer, loss, batch_size)
         )

@@ -136,6 +136,8 @@ def test_flags_reach_the_recipe(inside: Path, capsys: pytest.CaptureFixture[str]
         (["run", "walk.py", "--resume", "r", "--total-frames", "10"], "already trained"),
         (["run", "walk.py", "--eval-episodes", "0"], "--eval-episodes 0: give at least 1"),
         (["run", "nothing.py"], "no recipe file nothing.py"),
+        (["run", "walk"], "no recipe named walk; the file here is walk.py"),
+        (["cp", "ppo", "mine.txt"], "give one that ends in .py"),
         (["eval", "."], "not a run directory"),
         (["plot", "."], "not a run directory"),
     ],

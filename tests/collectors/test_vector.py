@@ -1,5 +1,6 @@
 import pytest
 import torch
+from torchrl.envs import RewardScaling, TransformedEnv
 
 from pgkit import collectors, envs, modules
 from pgkit.collectors.policy import trace
@@ -146,9 +147,18 @@ def test_frames_are_counted_and_bounded():
         collectors.VectorCollector(env, modules.gaussian_actor(env), frames_per_batch=50)
 
 
+@pytest.mark.parametrize("collector", [collectors.VectorCollector, collectors.AsyncCollector])
+def test_environments_of_torchrl_are_refused(collector):
+    env = envs.make("Pendulum-v1", num_envs=2)
+    scaled = TransformedEnv(env, RewardScaling(0, 1000))  # silently unscaled otherwise
+    with pytest.raises(UserError, match="a TransformedEnv is none of that: use collectors.TorchRLCollector"):
+        collector(scaled, modules.gaussian_actor(env), frames_per_batch=10)
+
+
 def test_an_actor_of_another_env():
     actor, _ = make("CartPole-v1")
-    with pytest.raises(UserError, match=r"cannot read observations of shape \(3,\).*built for another environment"):
+    misfit = r"cannot read observations of shape \(3,\).*built for another environment.*must match the size"
+    with pytest.raises(UserError, match=misfit):
         collectors.VectorCollector(envs.make("Pendulum-v1"), actor, frames_per_batch=10)
     reacher = modules.gaussian_actor(envs.make("Hopper-v5"))  # 11 observations, as InvertedDoublePendulum v4 had
     with pytest.raises(UserError, match="built for another environment"):

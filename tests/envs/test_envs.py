@@ -135,7 +135,10 @@ def test_a_discrete_space_may_start_elsewhere():
     [
         ("HalfCheeta-v5", "unknown environment id 'HalfCheeta-v5'; the nearest names are HalfCheetah-v5"),
         ("dm_control/cheetah-fly-v0", "nearest names are dm_control/cheetah-run-v0"),
-        ("HalfCheetah-v99", "unknown environment id"),
+        ("HalfCheetah-v99", "unknown environment id 'HalfCheetah-v99'; the nearest names are HalfCheetah-v5"),
+        ("HalfCheetah-v3", "one of Gymnasium's former ones: use HalfCheetah-v5"),
+        ("", "environment '': Malformed environment ID"),
+        ("no_such_module:Walk-v0", "no module 'no_such_module' to import"),
     ],
 )
 def test_unknown_ids(env_id, message):

@@ -137,6 +137,14 @@ def test_a_resume_that_cannot_work_writes_nothing(
     assert {p: p.read_bytes() for p in (tmp_path / "r").rglob("*") if p.is_file()} == before
 
 
+@pytest.mark.parametrize("name", ["config.json", "checkpoints/latest.pt"])
+def test_a_damaged_file_is_named(kit: SimpleNamespace, tmp_path: Path, name: str):
+    kit.train(arguments(tmp_path / "r"))
+    (tmp_path / "r" / name).write_bytes(b"{ half")
+    with pytest.raises(UserError, match=f"{name} (cannot be read|is damaged): "):
+        kit.train(arguments(tmp_path / "r", total=80, resume=tmp_path / "r"))
+
+
 def test_a_run_without_a_checkpoint_cannot_be_resumed(kit: SimpleNamespace, tmp_path: Path):
     kit.train(arguments(tmp_path / "r"))
     (tmp_path / "r/checkpoints/latest.pt").unlink()

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from pgkit.errors import UserError
-from pgkit.run.settings import RunArgs, launch, parse
+from pgkit.run.settings import RunArgs, check, launch, parse
 
 
 @dataclass
@@ -116,7 +116,66 @@ def test_launch_lets_other_errors_through_and_ctrl_c_exits_130():
     assert exit_.value.code == 130
 
 
-def test_a_bad_flag_exits_2(capsys: pytest.CaptureFixture[str]):
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("--total-frames many", "Error parsing --total-frames: invalid literal for int() with base 10: 'many'"),
+        ("--compile maybe", "invalid choice 'maybe' for argument '--compile'. Expected one of ('auto', 'on', 'off')."),
+        ("--wokers 3", "Unrecognized options: --wokers, 3; the nearest are --workers"),
+        ("CartPole-v1", "Unrecognized options: CartPole-v1; did you mean --env-id CartPole-v1?"),
+    ],
+)
+def test_a_bad_flag_is_one_line_and_exits_2(capsys: pytest.CaptureFixture[str], words: str, message: str):
     with pytest.raises(SystemExit) as exit_:
-        launch(lambda args: None, Args, argv=["--total-frames", "many"])
+        launch(lambda args: None, Args, argv=words.split())
     assert exit_.value.code == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"error: {message} (see pgkit run ") and error.endswith(" --help)\n")
+    assert error.count("\n") == 1
+
+
+def test_help_is_on_stdout_and_names_the_env_of_its_defaults(capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit) as exit_:
+        parse(Args, PRESETS, ["--env-id", "dm_control/hopper-hop-v0", "--help"])
+    assert not exit_.value.code
+    out = capsys.readouterr().out
+    assert "--env-id dm_control/hopper-hop-v0." in " ".join(out.split()) and "(default: 0.2)" in out
+
+
+def test_whole_numbers_may_have_an_exponent():
+    args = parse(Args, {}, ["--total-frames", "1e6", "--hidden", "32", "32", "--learning-rate", "1e-3"])
+    assert (args.total_frames, args.hidden, args.learning_rate) == (1_000_000, (32, 32), 1e-3)
+    with pytest.raises(UserError, match="--total-frames"):
+        parse(Args, {}, ["--total-frames", "1e-3"])
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ({"hidden": (64, 0)}, "--hidden 0: give at least 1"),
+        ({"learning_rate": -1.0}, "--learning-rate -1.0: give at least 0"),
+        ({"seed": -1}, "--seed -1: give at least 0"),
+        ({"gamma": 1.5}, "--gamma 1.5: give at most 1"),
+    ],
+)
+def test_numbers_that_no_run_can_have(setting: dict, message: str):
+    @dataclass
+    class Discounted(Args):
+        gamma: float | None = None
+
+    check(Discounted())
+    with pytest.raises(UserError, match=message):
+        check(Discounted(**setting))
+
+
+def test_a_stretched_annealing_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    @dataclass
+    class Annealed(Args):
+        anneal: bool = True
+
+    settings = {"env_id": "X-v0", "total_frames": 1000, "anneal": True}
+    (tmp_path / "config.json").write_text(json.dumps({"recipe": "walk", "settings": settings}))
+    parse(Annealed, {}, ["--resume", str(tmp_path)])
+    assert capsys.readouterr().out == ""
+    parse(Annealed, {}, ["--resume", str(tmp_path), "--total-frames", "2000"])
+    assert "anneals to zero at 2,000, no longer 1,000 frames" in capsys.readouterr().out
