@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from torchrl.data import LazyMemmapStorage, LazyTensorStorage
+from torchrl.data import LazyTensorStorage
 from torchrl.modules import ProbabilisticActor
 
 from pgkit import collectors, controllers, data, envs, heads, losses, modules, run, updates
@@ -158,7 +158,7 @@ def main(args: Args) -> None:
             temperature = controllers.Temperature(target_entropy, args.alpha_init)
 
         sampler = data.Prioritized() if args.replay == "prioritized" else None
-        storage = partial(LazyMemmapStorage, scratch_dir=args.buffer_dir) if args.buffer_dir else LazyTensorStorage
+        storage = data.in_files(args.buffer_dir) if args.buffer_dir else LazyTensorStorage
         buffer = data.ReplayBuffer(env, args.buffer_size, n_steps=args.n_step, sampler=sampler, storage=storage)
         groups = [
             {"params": list(actor.parameters()), "lr": args.learning_rate},

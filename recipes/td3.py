@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Literal
 
 import torch
-from torchrl.data import LazyMemmapStorage, LazyTensorStorage
+from torchrl.data import LazyTensorStorage
 
 from pgkit import collectors, data, envs, losses, modules, run, updates
 
@@ -95,7 +95,7 @@ def main(args: Args) -> None:
             args.buffer_size,
             n_steps=args.n_step,
             sampler=data.Prioritized() if args.replay == "prioritized" else None,
-            storage=partial(LazyMemmapStorage, scratch_dir=args.buffer_dir) if args.buffer_dir else LazyTensorStorage,
+            storage=data.in_files(args.buffer_dir) if args.buffer_dir else LazyTensorStorage,
         )
         groups = [
             {"params": list(actor.parameters()), "lr": args.learning_rate},

@@ -10,7 +10,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data import TensorSpec
+from torchrl.data import MultiCategorical, TensorSpec
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from pgkit.compiling import compile_record, record
@@ -76,19 +76,36 @@ def trace(
         return compile_record(graph, inputs)
 
 
-def random_actions(spec: TensorSpec, outputs: dict[NestedKey, Tensor]) -> Act:
-    """A policy that draws actions uniformly from ``spec``; its other outputs, shaped as ``outputs``, are NaN.
+def random_actions(
+    spec: TensorSpec,
+    outputs: dict[NestedKey, Tensor],
+    split: Callable[[Tensor], dict[str, Tensor]] = whole,
+) -> Act:
+    """A policy that draws actions uniformly from ``spec``, of those that an ``action_mask`` allows.
 
-    A recurrent state stays zero.
+    Its other outputs, shaped as ``outputs``, are NaN; a recurrent state stays zero.
     """
     others = {
         key: torch.full_like(x, 0.0 if key == STATE else torch.nan) for key, x in outputs.items() if key != "action"
     }
 
     def act(obs: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
-        return tuple(spec.rand() if key == "action" else others[key] for key in outputs)
+        mask = split(obs).get("action_mask")
+        action = spec.rand() if mask is None else _allowed(spec, mask.bool())
+        return tuple(action if key == "action" else others[key] for key in outputs)
 
     return act
+
+
+def _allowed(spec: TensorSpec, mask: Tensor) -> Tensor:
+    """Discrete actions drawn uniformly of those that a mask ``[N, choices]`` allows."""
+    several = isinstance(spec, MultiCategorical)
+    sizes = spec.nvec.reshape(-1, spec.shape[-1])[0].tolist() if several else [mask.shape[-1]]
+    parts = []
+    for part in mask.split(sizes, -1):
+        possible = part | ~part.any(-1, keepdim=True)  # a worker's padding allows nothing, and is thrown away
+        parts.append(torch.multinomial(possible.float(), 1))
+    return torch.cat(parts, -1) if several else parts[0].squeeze(-1)
 
 
 def check_env(env: Any, collector: Any) -> None:

@@ -97,7 +97,7 @@ class VectorCollector:
         else:
             obs = self.env.arrays.obs
             arrays = allocate(self._steps, obs, self._outputs)
-            act = random_actions(self.env.action_spec, self._outputs) if random else self._policy()
+            act = random_actions(self.env.action_spec, self._outputs, self.env.split) if random else self._policy()
             with torch.random.fork_rng(devices=[]):
                 fill(arrays, self.env.arrays, act, self._keys, self.env.num_envs, seed)
         self.frames += self.frames_per_batch

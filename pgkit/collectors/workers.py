@@ -163,7 +163,7 @@ def _serve(pipe: Connection, share: _Share) -> None:
         torch.set_num_threads(1)
         envs = ArrayEnv(cloudpickle.loads(share.make_env), share.count, share.seed, share.first)
         act = trace(share.actor, torch.zeros(share.num_envs, *envs.obs.shape[1:]), share.compile, share.split)
-        random_act = random_actions(share.action_spec, share.outputs)
+        random_act = random_actions(share.action_spec, share.outputs, share.split)
         arrays = {key: tensor.numpy() for key, tensor in share.shared.items()}
         pipe.send((None, None))
         while True:

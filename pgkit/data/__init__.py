@@ -1,6 +1,6 @@
 """Replay: uniform, prioritized, n-step, on TorchRL's storages."""
 
-from pgkit.data.files import BesideCheckpoint
+from pgkit.data.files import BesideCheckpoint, in_files
 from pgkit.data.prioritized import Prioritized
 from pgkit.data.recent import Recent
 from pgkit.data.replay import ReplayBuffer
@@ -10,4 +10,5 @@ __all__ = [
     "Prioritized",
     "Recent",
     "ReplayBuffer",
+    "in_files",
 ]

@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import atexit
 import os
+import shutil
+import tempfile
+from collections.abc import Callable
+from functools import partial
 from logging import getLogger
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
+from torchrl.data import LazyMemmapStorage
+from torchrl.data.replay_buffers import TensorStorage
 
 from pgkit.errors import UserError
 
@@ -41,6 +48,7 @@ def restore(buffer: ReplayBuffer, saved: dict[str, Any]) -> None:
                 f"the saved replay buffer is another one: its {name} is {theirs.get(name)}, here it is {value}; "
                 "give the same environment and settings, or train without the saved buffer"
             )
+    buffer.clear()
     buffer.written, buffer.start, buffer.finals = saved["counters"]
     buffer.owner[: len(saved["owner"])] = saved["owner"]
     buffer.generator.set_state(saved["generator"])
@@ -69,6 +77,24 @@ def load(buffer: ReplayBuffer, path: Path) -> None:
     restore(buffer, torch.load(path, weights_only=True))
 
 
+def in_files(folder: str | Path) -> Callable[[int], TensorStorage]:
+    """Makes a memory-mapped storage, for a buffer beyond RAM: ``ReplayBuffer(storage=in_files(folder))``.
+
+    Its files lie in a new folder within ``folder`` and are removed when the program ends; what is to last is saved by
+    ``ReplayBuffer.save``.
+
+    Raises:
+        UserError: nothing can be written there.
+    """
+    try:
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        own = tempfile.mkdtemp(prefix="replay-", dir=folder)
+    except OSError as error:
+        raise UserError(f"the replay buffer cannot be kept in {folder}: {error.strerror}") from error
+    atexit.register(shutil.rmtree, own, ignore_errors=True)
+    return partial(LazyMemmapStorage, scratch_dir=own)
+
+
 def _made_for(buffer: ReplayBuffer) -> dict[str, Any]:
     shapes = {str(key): tuple(x.shape[1:]) for key, x in buffer.observations.items()}
     return {
@@ -76,6 +102,7 @@ def _made_for(buffer: ReplayBuffer) -> dict[str, Any]:
         "observation": shapes,
         "action": tuple(buffer.frames["action"].shape[1:]),
         "num_envs": buffer.columns,
+        "n_steps": buffer.n_steps,
         "capacity": buffer.capacity,
         "final_rows": buffer.final_rows,
         "prioritized": buffer.sampler is not None,
@@ -102,13 +129,14 @@ class BesideCheckpoint:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Reads the file that belongs to the checkpoint, if there is one."""
-        if state["saved"] and self.path.is_file():
+        if state["saved"] and self.save and self.path.is_file():
             load(self.buffer, self.path)
             if self.buffer.written == state["written"]:
                 return
             self.buffer.clear()
         self.buffer.generator.set_state(state["generator"])
+        why = "its file is of another checkpoint" if state["saved"] and self.save else "it was not saved"
         _log.warning(
             "resumed without the replay buffer (%s): it fills again before training goes on; --save-buffer keeps it",
-            "its file is of another checkpoint" if state["saved"] else "it was not saved",
+            why,
         )

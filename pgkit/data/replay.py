@@ -35,7 +35,7 @@ class ReplayBuffer:
         n_steps: length of the returns: a sample's reward is the discounted sum of up to so many rewards, cut at the
             end of an episode; ``steps_to_next_obs`` has the number of them. The discount is the loss's.
         sampler: :class:`~pgkit.data.Prioritized`; None draws uniformly.
-        storage: makes a TorchRL storage of so many rows, e.g. ``partial(LazyMemmapStorage, scratch_dir=...)`` for a
+        storage: makes a TorchRL storage of so many rows, e.g. :func:`~pgkit.data.in_files` for a
             buffer beyond RAM.
         final_rows: final observations to keep; by default an eighth of the capacity.
         seed: of the draws; by default drawn from torch's global generator.

@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModule, dispatch
 from tensordict.utils import NestedKey
 
 from pgkit.errors import UserError
-from pgkit.heads import Head, Scalar
+from pgkit.heads import Head
 from pgkit.losses.q_base import QLoss, refuse_stochastic
 
 
@@ -63,8 +63,7 @@ class DDPGLoss(QLoss):
             actor_network, value_network, num_qvalue_nets=1, gamma=gamma, delay_actor=delay_actor,
             delay_qvalue=delay_value, separate_losses=separate_losses, reduction=reduction, head=head,
         )  # fmt: skip
-        if isinstance(self.head, Scalar):
-            self.head = Scalar(loss_function)
+        self.set_distance(loss_function)
 
     @property
     def value_network_params(self) -> Any:

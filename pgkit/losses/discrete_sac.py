@@ -12,7 +12,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data import TensorSpec
+from torchrl.data import Composite, TensorSpec
 
 from pgkit.functional import expected_soft_value, straight_through_sample, twin_minimum, value_loss
 from pgkit.losses.soft_base import SoftQLoss
@@ -70,6 +70,7 @@ class DiscreteSACLoss(SoftQLoss):
         *,
         action_space: str | TensorSpec | None = None,
         num_actions: int | None = None,
+        action_spec: TensorSpec | None = None,
         target_entropy_weight: float = 0.98,
         target_entropy: str | float = "auto",
         form: Literal["expectation", "gumbel_softmax"] = "expectation",
@@ -77,6 +78,9 @@ class DiscreteSACLoss(SoftQLoss):
         loss_function: str = "l2",
         **settings: Any,
     ) -> None:
+        if isinstance(action_spec, Composite):
+            action_spec = action_spec[actor_network.dist_sample_keys[0]]
+        num_actions = getattr(getattr(action_spec, "space", None), "n", None) if num_actions is None else num_actions
         if target_entropy == "auto" and num_actions is not None:
             target_entropy = target_entropy_weight * log(num_actions)
         super().__init__(
@@ -91,7 +95,7 @@ class DiscreteSACLoss(SoftQLoss):
         """Weights ``w`` and log-probabilities of all actions at the batch's observations, ``[*B, actions]`` each."""
         with params.to_module(self.actor_network, preserve_module_state=False):
             logits = self.actor_network.get_dist(batch.select(*self.actor_network.in_keys)).logits
-        log_prob = logits.log_softmax(-1).clamp_min(torch.finfo(logits.dtype).min)  # 0 log 0 = 0
+        log_prob = logits.log_softmax(-1).clamp_min(-1e6)  # 0 log 0 = 0, whatever the temperature
         if self.form == "expectation":
             return log_prob.exp(), log_prob
         return straight_through_sample(log_prob, self.relaxation), log_prob

@@ -98,6 +98,13 @@ class QLoss(Loss):
         if hasattr(actor_network, "dist_sample_keys"):
             self.set_keys(action=actor_network.dist_sample_keys[0], log_prob=actor_network.log_prob_keys[0])
 
+    def set_distance(self, loss_function: str) -> None:
+        """The distance of scalar critics that have no head of their own: ``l2``, ``l1`` or ``smooth_l1``."""
+        if self.head == Scalar():
+            self.head = Scalar(loss_function)
+        elif loss_function != "l2":
+            raise UserError(f"loss_function={loss_function!r} is for critics without a head, these have {self.head}")
+
     def act(self, batch: TensorDictBase, params: Any) -> tuple[Tensor, Tensor]:
         """An action drawn from the policy at the batch's observations, and its log-probability ``[*B]``: one draw."""
         with params.to_module(self.actor_network, preserve_module_state=False):
@@ -120,13 +127,15 @@ class QLoss(Loss):
         data = batch.select(*self.qvalue_network.in_keys, strict=False).set(self.tensor_keys.action, action)
         if self._each is not None:
             params = params if members is None else params[members]
-            return self._each(data, params).get(self.tensor_keys.state_action_value).movedim(0, -2)
+            out = self._each(data, params).get(self.tensor_keys.state_action_value)
+            return (out if out.dim() == data.dim() + 2 else out.squeeze(-2)).movedim(0, -2)
         members_of = getattr(self.qvalue_network, "members", None)
         if members is not None and members_of is not None:
             params, members = members_of(params, members), None
         with params.to_module(self.qvalue_network, preserve_module_state=False):
             out = self.qvalue_network(data).get(self.tensor_keys.state_action_value)
-        out = out if out.dim() > data.dim() + 1 else out.unsqueeze(-1)
+        if out.dim() == data.dim() + 1:  # [*B, critics], or what a single critic with a head writes
+            out = out.unsqueeze(-1 if self.head.size == 1 else -2)
         return out if members is None else out[..., members, :]
 
     def q(self, batch: TensorDictBase, action: Tensor, params: Any, members: Tensor | slice | None = None) -> Tensor:
@@ -163,7 +172,7 @@ class QLoss(Loss):
 
     def _reads(self) -> list[NestedKey]:
         keys, networks = self.tensor_keys, [*self.actor_network.in_keys, *self.qvalue_network.in_keys]
-        after = [*self.actor_network.in_keys, keys.reward, keys.done, keys.terminated]
+        after = [*[key for key in networks if key != keys.action], keys.reward, keys.done, keys.terminated]
         return [keys.action, *networks, *[("next", *((key,) if isinstance(key, str) else key)) for key in after]]
 
 

@@ -15,7 +15,7 @@ from torchrl.data import TensorSpec
 
 from pgkit.errors import UserError
 from pgkit.functional import ensemble_mean, random_subset, temperature_loss, twin_minimum
-from pgkit.heads import Head, Scalar
+from pgkit.heads import Head
 from pgkit.losses.q_base import QLoss
 
 
@@ -73,10 +73,7 @@ class SoftQLoss(QLoss):
             actor_network, qvalue_network, num_qvalue_nets=num_qvalue_nets, gamma=gamma, delay_actor=delay_actor,
             delay_qvalue=delay_qvalue, separate_losses=separate_losses, reduction=reduction, head=head,
         )  # fmt: skip
-        if self.head == Scalar():
-            self.head = Scalar(loss_function)
-        elif loss_function != "l2":
-            raise UserError(f"loss_function={loss_function!r} is for critics without a head, these have {self.head}")
+        self.set_distance(loss_function)
         if subset is not None and not 1 <= subset <= self.num_critics:
             raise UserError(f"subset={subset} of {self.num_critics} critics: give a number from 1 to the latter")
         values = {"min": twin_minimum, "mean": ensemble_mean}
@@ -111,7 +108,7 @@ class SoftQLoss(QLoss):
         if self.temperature is not None:
             return self.temperature.target_entropy
         if self._target_entropy is None:
-            raise AttributeError("target_entropy='auto' is read off the first batch of actions: none was seen yet")
+            raise UserError("target_entropy='auto' is read off the first batch of actions: none was seen yet")
         return self._target_entropy
 
     def draw(self) -> Tensor | None:

@@ -14,7 +14,7 @@ from torchrl.data import Bounded, Composite, TensorSpec
 
 from pgkit.errors import UserError
 from pgkit.functional import smoothed_action
-from pgkit.heads import Head, Scalar
+from pgkit.heads import Head
 from pgkit.losses.q_base import QLoss, refuse_stochastic
 
 
@@ -94,8 +94,7 @@ class TD3Loss(QLoss):
         numbers = {"min_action": low, "max_action": high, "policy_noise": policy_noise, "noise_clip": noise_clip}
         for name, number in numbers.items():
             self.register_buffer(name, torch.as_tensor(number))
-        if isinstance(self.head, Scalar):
-            self.head = Scalar(loss_function)
+        self.set_distance(loss_function)
 
     def _writes(self) -> list[NestedKey]:
         metrics = ["pred_value", "state_action_value_actor", "next_state_value", "target_value"]

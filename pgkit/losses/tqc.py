@@ -49,7 +49,8 @@ class TQCLoss(SoftQLoss):
         top_quantiles_to_drop_per_net: int = 2,
         **settings: Any,
     ) -> None:
-        own = getattr(qvalue_network, "head", None)
+        one = qvalue_network[0] if isinstance(qvalue_network, Sequence) else qvalue_network
+        own = getattr(one, "head", None)
         head = own if isinstance(own, Head) else Quantiles(drop=top_quantiles_to_drop_per_net)
         settings = {"actor_value": "mean", "head": head, "num_qvalue_nets": num_qvalue_nets, **settings}
         super().__init__(actor_network, qvalue_network, **settings)

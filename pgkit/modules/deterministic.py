@@ -12,7 +12,7 @@ from torchrl.envs import EnvBase
 
 from pgkit.modules.mlp import orthogonal
 from pgkit.modules.sizes import action_size, box_action
-from pgkit.modules.trunk import trunk
+from pgkit.modules.trunk import headed, trunk
 
 
 def deterministic_actor(
@@ -35,8 +35,7 @@ def deterministic_actor(
     space: Any = box_action(env, needs_bounds=True).space
     layers, features = trunk(env, hidden, activation, normalizer, encoder)
     head = orthogonal(nn.Linear(features, action_size(env)), 0.01)
-    net = nn.Sequential(*layers, head, Squash(space.low, space.high))
-    return TensorDictModule(net, in_keys=["observation"], out_keys=["action"])
+    return headed(layers, nn.Sequential(head, Squash(space.low, space.high)), ["action"])
 
 
 class Squash(nn.Module):

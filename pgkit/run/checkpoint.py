@@ -50,7 +50,7 @@ def restore(tracked: dict[str, Stateful], states: dict[str, Any], where: Path) -
     for name, owner in tracked.items():
         try:
             owner.load_state_dict(states[name])
-        except (RuntimeError, KeyError) as error:
+        except (RuntimeError, KeyError, IndexError, ValueError) as error:
             reason = str(error).strip().splitlines()[-1].strip()
             raise UserError(
                 f"{where}: the state of {name} does not fit what the recipe built: networks and optimizers keep their "

@@ -117,10 +117,10 @@ class Run:
         self._episodes.extend(finished_episodes(rollout))
         self._recent += [metrics] if metrics else []
         due = frames >= self.args.total_frames
-        if not (due or self._interrupted or frames // every > self.frames // every):
-            return
         if self.args.eval_every:
             due |= frames // self.args.eval_every > self.frames // self.args.eval_every
+        if not (due or self._interrupted or frames // every > self.frames // every):
+            return
         self.frames = frames
         row: dict[str, float] = {
             "frames": frames,

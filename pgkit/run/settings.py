@@ -58,7 +58,9 @@ _BOUNDS: dict[str, tuple[float, float]] = {
     **dict.fromkeys(("hidden", "critic_hidden"), (1, math.inf)),
     **dict.fromkeys(("seed", "eval_every", "random_frames", "updates_per_step", "max_grad_norm"), (0, math.inf)),
     **dict.fromkeys(("learning_rate", "q_learning_rate", "alpha_learning_rate", "clip_epsilon"), (0, math.inf)),
-    **dict.fromkeys(("gamma", "lmbda", "tau", "dropout"), (0, 1)),
+    **dict.fromkeys(("gamma", "lmbda", "tau"), (0, 1)),
+    "alpha": (0, math.inf),
+    "dropout": (0, 0.99),
     "alpha_init": (1e-8, math.inf),
 }
 

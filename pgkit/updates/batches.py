@@ -10,6 +10,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from pgkit.data import ReplayBuffer
+from pgkit.errors import UserError
 from pgkit.updates import wiring
 
 Draw = tuple[TensorDictBase, Tensor]
@@ -51,17 +52,24 @@ class OwnBatches:
     """From pgkit's replay: only row numbers are drawn, the rest is in the graph."""
 
     def __init__(self, buffer: ReplayBuffer, loss: nn.Module, batch_size: int) -> None:
-        self.buffer, self.batch_size = buffer, batch_size
-        self._gather = buffer.gather(discount(loss) if buffer.n_steps > 1 else 1.0)
+        self.buffer, self.loss, self.batch_size = buffer, loss, batch_size
+        self.priority = priority_key(loss)
 
     def extend(self, rollout: TensorDictBase) -> None:
         self.buffer.extend(rollout)
 
     def gather(self, data: TensorDictBase, index: Tensor) -> TensorDictBase:
-        return self._gather(data, index)
+        return self.buffer.gather(discount(self.loss) if self.buffer.n_steps > 1 else 1.0)(data, index)
 
     def write_back(self, data: TensorDictBase, index: Tensor, batch: TensorDictBase) -> None:
-        self.buffer.write_back(data, index, batch)
+        if self.buffer.sampler is None:
+            return
+        if self.priority not in batch.keys(True):
+            raise UserError(
+                f"the replay is prioritized, but {type(self.loss).__name__} writes no '{self.priority}' into the "
+                "batch: write the absolute error [*B] there, or draw uniformly"
+            )
+        self.buffer.write_back(data, index, batch.select().set("td_error", batch[self.priority]))
 
     def written(self) -> list[Tensor]:
         return [] if self.buffer.sampler is None else self.buffer.sampler.tensors
@@ -84,7 +92,7 @@ class TorchRLBatches:
 
     def __init__(self, buffer: Any, loss: nn.Module, batch_size: int) -> None:
         self.buffer, self.loss, self.batch_size = buffer, loss, batch_size
-        self.priority = getattr(loss.tensor_keys, "priority", "td_error")
+        self.priority = priority_key(loss)
         self.prioritized = (
             hasattr(getattr(buffer, "sampler", None), "update_priority")
             and "Prioritized" in type(buffer.sampler).__name__
@@ -120,7 +128,14 @@ class TorchRLBatches:
         return {f"{type(t).__name__} of {type(self.buffer).__name__}": t for t in transforms or ()}
 
 
+def priority_key(loss: nn.Module) -> Any:
+    """Where a loss writes the priorities of a batch."""
+    return getattr(getattr(loss, "tensor_keys", None), "priority", "td_error")
+
+
 def discount(loss: nn.Module) -> Any:
     """The discount of a loss: its own ``gamma``, or its value estimator's."""
-    gamma = getattr(loss, "gamma", None)
-    return loss.value_estimator.gamma if gamma is None else gamma
+    owner = loss if getattr(loss, "gamma", None) is not None else getattr(loss, "value_estimator", None)
+    if owner is None:
+        raise UserError(f"n-step returns are discounted by the loss's gamma: give {type(loss).__name__} one")
+    return owner.gamma

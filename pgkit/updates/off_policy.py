@@ -116,10 +116,13 @@ class OffPolicyUpdate:
             self._batches.drawn()
             self.updates += 1
         metrics: dict[str, float] = {}
-        for whole in (False, True):  # the whole step's names win
+        for whole in (False, True):  # a name that both kinds of step have is averaged over all of them
             if results[whole]:
                 means = torch.stack(results[whole]).mean(0) if len(results[whole]) > 1 else results[whole][0]
-                metrics |= dict(zip(self._steps[whole].names, means.tolist(), strict=True))
+                share = len(results[whole]) / (len(results[True]) + len(results[False]))
+                for name, mean in zip(self._steps[whole].names, means.tolist(), strict=True):
+                    both = share < 1 and all(name in self._steps[kind].names for kind in (True, False))
+                    metrics[name] = metrics.get(name, 0.0) + (share if both else 1.0) * mean
         return metrics
 
     def __str__(self) -> str:

@@ -94,7 +94,7 @@ class GradientStep:
                     apply(grads)
                     if after is not None:
                         after()
-                metrics = torch.stack([*(out[name].detach().mean().to(norm.dtype) for name in names), norm])
+                metrics = torch.stack([*(out[name].detach().to(norm.dtype).mean() for name in names), norm])
             return metrics, [] if apply is not None else grads
 
         # dynamo caches by code object: one of its own keeps each agent's graph apart from every other agent's

@@ -33,10 +33,13 @@ def averaging(loss: nn.Module, tau: float) -> Callable[[], None] | None:
     None for a loss without delayed parameters.
     """
     pairs = target_pairs(loss)
+    # separate_losses holds shared parameters detached: the memory tells what is trained
+    trained = {x.data_ptr() for x in loss.parameters() if x.requires_grad}
+    moves = [source.data_ptr() in trained for _, source in pairs]
 
     def average() -> None:
-        for target, source in pairs:
-            if source.requires_grad:
+        for (target, source), moving in zip(pairs, moves, strict=True):
+            if moving:
                 target.lerp_(source.detach(), tau)
             else:
                 target.copy_(source)

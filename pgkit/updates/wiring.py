@@ -28,7 +28,8 @@ def read_keys(loss: nn.Module, data: TensorDictBase) -> list[Any]:
         keys += [key for key in configured if isinstance(key, str | tuple)]
         if getattr(loss.tensor_keys, "advantage", None) in present:
             keys = [key for key in keys if not (isinstance(key, tuple) and key[0] == "next")]
-    keys += [("collector", "mask"), *getattr(getattr(loss, "actor_network", None), "dist_params_keys", ())]
+    keys += [("collector", "mask"), "steps_to_next_obs"]  # read by TorchRL's estimators, which no loss's keys say
+    keys += [*getattr(getattr(loss, "actor_network", None), "dist_params_keys", ())]
     return [key for key in dict.fromkeys(keys) if key in present]
 
 

@@ -1,11 +1,8 @@
 """The replay buffer against the rollouts it was filled from, frame by frame."""
 
-from functools import partial
-
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.data import LazyMemmapStorage
 
 from pgkit import collectors, data, envs, modules
 from pgkit.errors import UserError
@@ -136,7 +133,7 @@ def test_draws_are_uniform_over_all_frames_and_have_a_generator_of_their_own():
 def test_memmap_storage_gives_the_same_batches(tmp_path):
     env = envs.make("Pendulum-v1")
     here = data.ReplayBuffer(env, 50, seed=0)
-    there = data.ReplayBuffer(env, 50, seed=0, storage=partial(LazyMemmapStorage, scratch_dir=tmp_path))
+    there = data.ReplayBuffer(env, 50, seed=0, storage=data.in_files(tmp_path))
     for rollout in rollouts(env, 30, 3):
         here.extend(rollout)
         there.extend(rollout)
@@ -172,3 +169,32 @@ def test_refusals(tmp_path):
         data.ReplayBuffer(pendulum, 0)
     with pytest.raises(UserError, match="no saved replay buffer"):
         buffer.load(tmp_path / "nothing.pt")
+
+
+def test_what_a_buffer_held_is_gone_after_a_load(tmp_path):
+    env = envs.make("Pendulum-v1")
+    few, many = data.ReplayBuffer(env, 60, seed=0), data.ReplayBuffer(env, 60, seed=0)
+    batches = list(rollouts(env, 10, 12))
+    few.extend(batches[0])
+    for rollout in batches[1:]:
+        many.extend(rollout)
+    many.load_state_dict(few.state_dict())
+    for rollout in batches[1:4]:
+        few.extend(rollout)
+        many.extend(rollout)
+    assert len(many) == len(few) == 40
+    assert (many.sample(32) == few.sample(32)).all()
+    with pytest.raises(UserError, match="its n_steps is 1, here it is 3"):
+        data.ReplayBuffer(env, 60, n_steps=3).load_state_dict(few.state_dict())
+
+
+def test_files_of_two_buffers_in_one_folder_are_apart(tmp_path):
+    env = envs.make("Pendulum-v1")
+    one, two = (data.ReplayBuffer(env, 50, seed=0, storage=data.in_files(tmp_path / "replay")) for _ in range(2))
+    first, second = rollouts(env, 30, 2)
+    one.extend(first)
+    two.extend(second)
+    assert torch.equal(one.observations["observation"][:30], first["observation"][0])
+    (tmp_path / "file").touch()
+    with pytest.raises(UserError, match="cannot be kept in .*file: "):
+        data.in_files(tmp_path / "file")

@@ -15,6 +15,7 @@ from torchrl.objectives import SoftUpdate
 
 from pgkit import collectors, controllers, data, envs, functional, losses, modules, updates
 from pgkit.errors import UserError
+from tests.modules.test_discrete import Masked
 
 FORMS = ["expectation", "gumbel_softmax"]
 
@@ -198,6 +199,21 @@ def test_a_forbidden_action_costs_nothing_and_breaks_nothing():
 
 
 @pytest.mark.parametrize("form", FORMS)
+def test_a_forbidden_action_stays_harmless_at_any_temperature(form):
+    torch.manual_seed(0)
+    env = envs.make(Masked, num_envs=4, seed=1, flatten=False)
+    actor = modules.categorical_actor(env, hidden=(8,))
+    critics = TensorDictModule(modules.mlp(3, 4, (8,)), ["observation"], ["action_value"])
+    rollout = collectors.VectorCollector(env, actor, frames_per_batch=64, compile="off").rollout().reshape(-1)
+    loss = losses.DiscreteSACLoss(actor, [critics], alpha_init=30.0, form=form)
+    SoftUpdate(loss, tau=0.1)
+    out = loss(rollout)
+    assert all(value.isfinite() for value in out.values())
+    grads = torch.autograd.grad(out["loss_actor"], [x for x in loss.actor_network_params.values(True, True)])
+    assert all(grad.isfinite().all() for grad in grads)
+
+
+@pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("one_hot", [False, True])
 def test_trains_on_replayed_actions_eager_as_compiled(form, one_hot):
     results = []
@@ -244,3 +260,13 @@ def test_refusals():
         losses.DiscreteSACLoss(modules.categorical_actor(env), modules.discrete_q_value(env), form="sampled")
     with pytest.raises(UserError, match="discrete_q_value needs one discrete action.*modules.q_value"):
         modules.discrete_q_value(envs.make("Pendulum-v1"))
+
+
+def test_the_target_entropy_comes_from_the_number_of_actions():
+    env = envs.make("CartPole-v1", num_envs=2)
+    networks = modules.categorical_actor(env, (8,)), modules.discrete_q_value(env, 2, (8,))
+    expected = pytest.approx(0.98 * math.log(2))
+    assert losses.DiscreteSACLoss(*networks, num_actions=2).target_entropy == expected
+    assert losses.DiscreteSACLoss(*networks, action_spec=env.action_spec_unbatched).target_entropy == expected
+    with pytest.raises(UserError, match="read off the first batch"):
+        _ = losses.DiscreteSACLoss(*networks).target_entropy

@@ -11,7 +11,7 @@ from torchrl.modules import ProbabilisticActor, TanhNormal
 from torchrl.objectives import SACLoss as TorchRLSACLoss
 from torchrl.objectives import SoftUpdate
 
-from pgkit import controllers, envs, losses, modules
+from pgkit import collectors, controllers, envs, heads, losses, modules
 from pgkit.errors import UserError
 
 
@@ -162,7 +162,7 @@ def test_target_entropy_is_minus_the_number_of_action_dimensions(name, dimension
     obs = env.observation_spec_unbatched["observation"].shape[0]
     loss = losses.SACLoss(modules.tanh_normal_actor(env, (4,)), modules.q_value(env, hidden=(4,)))
     SoftUpdate(loss, tau=0.1)
-    with pytest.raises(AttributeError):
+    with pytest.raises(UserError, match="read off the first batch"):
         _ = loss.target_entropy
     loss(batch(4, obs, dimensions))
     assert loss.target_entropy == -dimensions
@@ -187,3 +187,43 @@ def test_a_discrete_actor_is_refused():
     critics = modules.q_value(envs.make("Pendulum-v1"))
     with pytest.raises(UserError, match=r"Categorical.*categorical_actor.*DiscreteSACLoss"):
         losses.SACLoss(actor, critics)
+
+
+def test_a_single_critic_with_a_head_has_outputs_and_not_critics():
+    env = envs.make("Pendulum-v1")
+    actor = modules.deterministic_actor(env, (8,))
+    net = TensorDictModule(Joined(5), in_keys=["observation", "action"], out_keys=["state_action_value"])
+    loss = losses.DDPGLoss(actor, net, head=heads.Quantiles(5, 0))
+    rollout = collectors.VectorCollector(env, actor, frames_per_batch=16).rollout().reshape(-1)
+    assert loss.returns(rollout, rollout["action"], loss.qvalue_network_params).shape == (16, 1, 5)
+    several = [modules.q_value(env, 1, (8,), head=heads.Quantiles(5, 1)) for _ in range(2)]
+    stochastic = modules.tanh_normal_actor(env, (8,))
+    loss = losses.TQCLoss(stochastic, several)
+    SoftUpdate(loss, tau=0.1)
+    assert loss.head == heads.Quantiles(5, 1)
+    assert loss.returns(rollout, rollout["action"], loss.qvalue_network_params).shape == (16, 2, 5)
+    assert loss(rollout)["loss_qvalue"] > 0
+
+
+class Joined(torch.nn.Module):
+    """A critic of one's own, ``[*B, outputs]``."""
+
+    def __init__(self, outputs):
+        super().__init__()
+        self.net = torch.nn.Linear(4, outputs)
+
+    def forward(self, observation, action):
+        return self.net(torch.cat([observation, action], -1))
+
+
+@pytest.mark.parametrize("loss", [losses.TD3Loss, losses.DDPGLoss])
+def test_a_distance_has_one_owner(loss):
+    env = envs.make("Pendulum-v1")
+    actor = modules.deterministic_actor(env, (8,))
+    settings = {"action_spec": env.action_spec_unbatched} if loss is losses.TD3Loss else {}
+    number = 2 if settings else 1
+    assert loss(actor, modules.q_value(env, number, (8,)), head=heads.Scalar("l1"), **settings).head.distance == "l1"
+    assert loss(actor, modules.q_value(env, number, (8,)), loss_function="l1", **settings).head.distance == "l1"
+    quantiles = modules.q_value(env, number, (8,), head=heads.Quantiles(5, 1))
+    with pytest.raises(UserError, match="loss_function='l1' is for critics without a head"):
+        loss(actor, quantiles, loss_function="l1", **settings)

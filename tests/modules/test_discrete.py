@@ -79,9 +79,13 @@ def test_only_legal_actions_are_collected():
     for make in (Masked, lambda: Masked(several, 6)):
         env = envs.make(make, num_envs=4, seed=1, flatten=False)
         actor = modules.categorical_actor(env, hidden=(8,))
-        rollout = collectors.VectorCollector(env, actor, frames_per_batch=256, compile="off").rollout()
+        for random_frames in (0, 256):
+            sizes = {"frames_per_batch": 256, "init_random_frames": random_frames, "compile": "off"}
+            rollout = collectors.VectorCollector(env, actor, **sizes).rollout()
+            assert not rollout["next", "terminated"].any()
+            assert len(rollout["action"].unique()) == 4
         assert rollout["action_mask"].dtype == torch.bool and rollout["observation"].shape == (4, 64, 3)
-        assert not rollout["next", "terminated"].any() and rollout["next", "truncated"].sum() == 16
+        assert rollout["next", "truncated"].sum() == 16
 
 
 def test_a_mask_that_allows_nothing_is_refused():

@@ -46,3 +46,10 @@ def test_what_is_missing_is_named():
     flat = envs.make(Sensors, num_envs=2)
     with pytest.raises(UserError, match=r"the actor reads 'picture', the environment observes observation: .*flat"):
         collectors.VectorCollector(flat, modules.gaussian_actor(env, encoder=encoder()), frames_per_batch=4)
+
+
+def test_a_deterministic_actor_reads_the_entries_of_its_encoder():
+    env = envs.make(Sensors, num_envs=3, seed=1, flatten=False)
+    actor = modules.deterministic_actor(env, encoder=encoder())
+    assert actor.in_keys == ["picture", "speed"]
+    assert actor(env.reset())["action"].shape == env.action_spec.shape

@@ -61,6 +61,22 @@ def test_a_row_every_so_many_frames_has_the_means_since_the_last(kit: SimpleName
     assert [float(r["train/draw"]) for r in some] == [sum(every[:2]) / 2, sum(every[2:]) / 2]
 
 
+def test_an_evaluation_is_not_late_for_a_row(kit: SimpleNamespace, tmp_path: Path):
+    often = arguments(tmp_path / "r", total=80)
+    often.eval_every = 10
+    kit.train(often, every=40)
+    assert [row["frames"] for row in rows(tmp_path / "r") if row["eval/mean_reward"]] == [
+        "10",
+        "20",
+        "30",
+        "40",
+        "50",
+        "60",
+        "70",
+        "80",
+    ]
+
+
 def test_evaluating_does_not_change_the_training(kit: SimpleNamespace, tmp_path: Path):
     kit.train(arguments(tmp_path / "often"))
     seldom = arguments(tmp_path / "seldom")

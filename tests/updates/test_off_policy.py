@@ -4,11 +4,15 @@ import copy
 
 import pytest
 import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
 from torchrl.data import LazyTensorStorage, ReplayBuffer, TensorDictReplayBuffer
+from torchrl.envs import MultiStepTransform
 from torchrl.objectives import SACLoss as TorchRLSACLoss
 
 from pgkit import collectors, controllers, data, envs, losses, modules, updates
 from pgkit.errors import UserError
+from pgkit.updates.targets import averaging
 
 
 def agent(compile="off", *, seed=0, buffer=None, loss="pgkit", num_envs=1, optimizer=torch.optim.Adam, **kwargs):
@@ -207,3 +211,104 @@ def test_compiled_writes_to_scalars_outlive_the_step():
     update.train(1)
     sampler = update.buffer.sampler
     assert sampler is not None and sampler.largest.item() == sampler.tree.values.max().item() != 1.0
+
+
+def test_n_step_returns_of_torchrl_s_replay_are_discounted_for_all_their_steps():
+    torch.manual_seed(0)
+    env = envs.make("Pendulum-v1")
+    actor = modules.tanh_normal_actor(env, (16,))
+    loss = TorchRLSACLoss(actor, [modules.q_value(env, 1, (16,)) for _ in range(2)], target_entropy=-1.0)
+    loss.make_value_estimator(gamma=0.9)
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(100), transform=MultiStepTransform(3, 0.9))
+    update = updates.OffPolicyUpdate(
+        loss, buffer, torch.optim.Adam(loss.parameters()), batch_size=8, learning_starts=8, compile="off"
+    )
+    update._batches.extend(collectors.VectorCollector(env, actor, frames_per_batch=64).rollout())
+    data, index = next(update._batches.draw(1))
+    batch = update._batches.gather(data, index)
+    assert (batch["steps_to_next_obs"] == 3).any()
+
+
+def test_targets_of_shared_parameters_lag_behind():
+    torch.manual_seed(0)
+    env = envs.make("Pendulum-v1")
+    shared = torch.nn.Linear(3, 8)
+    actor = modules.tanh_normal_actor(env, encoder=shared)
+    critic = TensorDictModule(TwoInputs(shared), in_keys=["observation", "action"], out_keys=["state_action_value"])
+    loss = losses.SACLoss(actor, [critic], separate_losses=True)
+    average = averaging(loss, tau=0.25)
+    targets = loss.target_qvalue_network_params
+    key = next(key for key in targets.keys(True, True) if targets[key].shape == shared.weight.shape)
+    before = targets[key].clone()
+    with torch.no_grad():
+        shared.weight += 1.0
+    assert average is not None
+    average()
+    torch.testing.assert_close(targets[key], before + 0.25)
+
+
+class TwoInputs(torch.nn.Module):
+    """A critic on an encoder of the observation."""
+
+    def __init__(self, encoder):
+        super().__init__()
+        self.encoder, self.value = encoder, torch.nn.Linear(9, 1)
+
+    def forward(self, observation, action):
+        return self.value(torch.cat([self.encoder(observation), action], -1))
+
+
+def test_metrics_are_means_over_steps_with_and_without_the_actor():
+    update, collector = agent(actor_delay=2, optimizer=lambda parameters, lr: torch.optim.SGD(parameters, lr=0.0))
+    update._batches.extend(collector.rollout())
+    update._batches.extend(collector.rollout())
+    draws = [update.buffer.sample_index(32) for _ in range(4)]
+    update.buffer.sample_index = lambda batch_size, batches=1: torch.cat(draws[:batches])
+    torch.manual_seed(0)
+    each = []
+    for _ in range(4):
+        each += [update.train(1)["loss_qvalue"]]
+        draws.append(draws.pop(0))
+    update.updates = 0
+    torch.manual_seed(0)
+    assert update.train(4)["loss_qvalue"] == pytest.approx(sum(each) / 4, rel=1e-5)
+    assert len({round(value, 6) for value in each}) == 4
+
+
+def test_priorities_under_another_key_and_a_loss_without_any():
+    torch.manual_seed(0)
+    env = envs.make("Pendulum-v1")
+    actor = modules.tanh_normal_actor(env, (16,))
+    loss = losses.SACLoss(actor, modules.q_value(env, hidden=(16,)))
+    loss.set_keys(priority="error")
+    settings = {"batch_size": 32, "learning_starts": 64, "compile": "off"}
+    rollout = collectors.VectorCollector(env, actor, frames_per_batch=64).rollout()
+
+    def prioritized(loss):
+        buffer = data.ReplayBuffer(env, 100, sampler=data.Prioritized(), seed=0)
+        return updates.OffPolicyUpdate(loss, buffer, torch.optim.Adam(loss.parameters()), **settings)
+
+    update = prioritized(loss)
+    assert update(rollout)["loss_qvalue"] > 0
+
+    class Regression(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.net = torch.nn.Linear(3, 1)
+
+        def forward(self, batch):
+            error = self.net(batch["observation"]) - batch["next", "reward"]
+            return TensorDict({"loss_reward": error.square().mean(), "rows": len(batch)})
+
+    with pytest.raises(UserError, match="Regression writes no 'td_error' into the batch"):
+        prioritized(Regression())(rollout)
+    uniform = data.ReplayBuffer(env, 100, seed=0)
+    loss = Regression()
+    assert (
+        updates.OffPolicyUpdate(loss, uniform, torch.optim.Adam(loss.parameters()), **settings)(rollout)["rows"] == 32
+    )
+    steps = data.ReplayBuffer(env, 100, n_steps=3, seed=0)
+    with pytest.raises(UserError, match="give Regression one"):
+        updates.OffPolicyUpdate(
+            loss, steps, torch.optim.Adam(loss.parameters()), **{**settings, "learning_starts": 62}
+        )(rollout)
