@@ -33,7 +33,7 @@ def gather(data: TensorDictBase, index: Tensor, *, rows: int, n_steps: int, gamm
     for _ in range(n_steps - 1):
         goes_on = (next_row < rows).unsqueeze(-1)
         row = next_row.clamp_max(rows - 1)
-        reward = reward + goes_on * gamma**steps * frames["reward"][row]
+        reward = reward + torch.where(goes_on, gamma**steps * frames["reward"][row], 0.0)  # an unused row may be NaN
         terminated = torch.where(goes_on, frames["terminated"][row], terminated)
         done = torch.where(goes_on, frames["done"][row], done)
         next_row = torch.where(goes_on.squeeze(-1), frames["next_row"][row].long(), next_row)

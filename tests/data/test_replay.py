@@ -87,6 +87,17 @@ def test_n_steps_stop_at_a_truncation_and_at_a_termination():
     assert batch["next", "done"].squeeze(-1).tolist() == [True, True, True, True]
 
 
+def test_rows_never_written_do_not_reach_a_batch():
+    buffer = data.ReplayBuffer(envs.make("Pendulum-v1"), 50, n_steps=3, seed=0)
+    for table in (buffer.frames, buffer.observations):
+        for x in table.values():
+            if x.dtype.is_floating_point:
+                x.fill_(torch.nan)  # what an allocation may hold
+    buffer.extend(hand_made([*range(6)], [1.0] * 5, terminated=[2]))
+    batch = kept(buffer)
+    assert all(x.isfinite().all() for x in batch.values(True, True))
+
+
 def test_rollouts_that_do_not_continue_one_another_keep_their_next_observations():
     buffer = data.ReplayBuffer(envs.make("Pendulum-v1"), 100)
     buffer.extend(hand_made([0, 1, 2], [1, 1]))

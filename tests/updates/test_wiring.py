@@ -76,7 +76,8 @@ def test_the_diagram_names_blocks_entries_and_then_shapes():
 
 def test_the_diagram_of_a_replay_agent():
     agent = ReplayAgent()
-    update = updates.OffPolicyUpdate(agent.loss, agent.buffer, torch.optim.Adam(agent.loss.parameters()))
+    sizes = {"batch_size": 32, "learning_starts": 64}
+    update = updates.OffPolicyUpdate(agent.loss, agent.buffer, torch.optim.Adam(agent.loss.parameters()), **sizes)
     text = str(update)
     assert "SACLoss, gamma 0.99" in text and "loss_actor + loss_qvalue + loss_alpha" in text and "ReplayBuffer" in text
 
