@@ -206,6 +206,8 @@ def test_files_of_two_buffers_in_one_folder_are_apart(tmp_path):
     one.extend(first)
     two.extend(second)
     assert torch.equal(one.observations["observation"][:30], first["observation"][0])
+    folders = list((tmp_path / "replay").iterdir())
+    assert len(folders) == 2 and all(any(folder.iterdir()) for folder in folders)
     (tmp_path / "file").touch()
     with pytest.raises(UserError, match="cannot be kept in .*file: "):
         data.in_files(tmp_path / "file")
