@@ -15,8 +15,8 @@ from pgkit.run.settings import RunArgs
 
 Curve = list[tuple[float, float]]
 TRAINING, EVALUATION = "rollout/ep_rew_mean", "eval/mean_reward"
-# settings in which seeds of one experiment may differ; the rest of every recipe's, and num_envs, change what is learned
-_INCIDENTAL = {field.name for field in fields(RunArgs)} - {"num_envs"}
+# settings in which runs of one experiment may differ: they do not change what is learned
+_INCIDENTAL = {field.name for field in fields(RunArgs)} - {"num_envs"} | {"log_every", "save_buffer", "buffer_dir"}
 
 
 def plot(run_dirs: Sequence[str | Path], out: str | Path, x: Literal["frames", "wall"] = "frames") -> None:

@@ -52,7 +52,7 @@ def main(options: Options) -> None:
     """Prints the table, writes the figure."""
     names = labels({path: read_config(path) for path in [*options.runs, *options.speed]})
     speeds = {names[path]: json.loads((path / "summary.json").read_text())["time/fps"] for path in options.speed}
-    figure = Figure(figsize=(7, 4.5), layout="constrained")
+    figure = Figure(figsize=(7, 5), layout="constrained")
     axes = figure.subplots()
     print("| experiment | return of each seed | interquartile mean | 95% | frames/s | minutes |")
     print("|---|---|---|---|---|---|")
@@ -72,7 +72,7 @@ def main(options: Options) -> None:
         axes.plot(frames / speeds[name] / 60, mean, marker="o", label=f"{name} ({len(last)})")
     axes.set(xlabel="minutes", ylabel="return of an evaluation, mean over seeds")
     axes.grid(alpha=0.3)
-    axes.legend(frameon=False)
+    figure.legend(loc="outside lower center", fontsize="small", frameon=False)
     figure.savefig(options.out, dpi=150)
 
 
