@@ -79,7 +79,7 @@ def make_one(env_id: str, **kwargs: Any) -> gym.Env:
             raise UserError(
                 f"environment '{env_id}' needs ale-py: pip install ale-py, then give its id as ale_py:{env_id}"
             ) from error
-        raise _unknown(env_id, [known for known in gym.registry if not _supported(known)]) from error
+        raise _unknown(env_id, [known for known in gym.registry if not _successor(known)]) from error
     except (gym.error.DependencyNotInstalled, ImportError) as error:
         raise _not_installed(env_id, error) from error
     except gym.error.Error as error:
@@ -90,7 +90,7 @@ def _not_installed(env_id: str, error: Exception) -> UserError:
     module, colon, _ = env_id.partition(":")
     if colon:
         return UserError(f"environment '{env_id}': no module '{module}' to import, neither here nor installed")
-    if newest := _supported(env_id):
+    if newest := _successor(env_id):
         return UserError(f"environment '{env_id}' is one of Gymnasium's former ones: use {newest}")
     reason = str(error).splitlines()[0].rstrip(".")
     return UserError(
@@ -98,7 +98,7 @@ def _not_installed(env_id: str, error: Exception) -> UserError:
     )
 
 
-def _supported(env_id: str) -> str | None:
+def _successor(env_id: str) -> str | None:
     """The newest version of an environment, if MuJoCo's version 2 or 3 is asked for; those live in another package."""
     name, _, version = env_id.rpartition("-v")
     if version not in ("2", "3"):

@@ -67,11 +67,13 @@ class OffPolicyUpdate:
                 "update: raise learning_starts or lower batch_size"
             )
         own = isinstance(buffer, ReplayBuffer)
-        capacity = buffer.capacity if own else buffer.storage.max_size
+        unfinished = (buffer.n_steps - 1) * buffer.columns if own else 0  # frames whose n-step return is not there yet
+        capacity = buffer.capacity - unfinished if own else buffer.storage.max_size
         if capacity < learning_starts:
             raise UserError(
-                f"the replay keeps {capacity:,} frames and updates begin at learning_starts={learning_starts:,}: raise "
-                "its capacity (--buffer-size) or lower learning_starts (--random-frames, --batch-size)"
+                f"the replay has at most {capacity:,} frames to draw from and updates begin at learning_starts="
+                f"{learning_starts:,}: raise its capacity (--buffer-size) or lower learning_starts (--random-frames, "
+                "--batch-size)"
             )
         if total_frames is not None and total_frames < learning_starts:
             raise UserError(

@@ -174,10 +174,12 @@ def test_resumed_with_its_buffer_it_goes_on_bit_for_bit():
 def test_refusals():
     with pytest.raises(UserError, match="batch_size=128 is above the learning_starts=64 frames stored"):
         agent(batch_size=128)
-    with pytest.raises(UserError, match="the replay keeps 500 frames and updates begin at learning_starts=501"):
+    with pytest.raises(UserError, match="at most 500 frames to draw from and updates begin at learning_starts=501"):
         agent(learning_starts=501)
-    with pytest.raises(UserError, match="the replay keeps 50 frames"):
+    with pytest.raises(UserError, match="at most 50 frames"):
         agent(buffer=lambda _: TensorDictReplayBuffer(storage=LazyTensorStorage(50)))
+    with pytest.raises(UserError, match="at most 60 frames"):
+        agent(buffer=lambda env: data.ReplayBuffer(env, 64, n_steps=3), num_envs=2)
     with pytest.raises(UserError, match="total_frames=63 end before updates begin at learning_starts=64"):
         agent(total_frames=63)
 
