@@ -21,6 +21,8 @@ _OPTIONS: dict[str, Any] = {
     "always_keep_tensor_constants": True,
     "reorder_for_locality": False,
 }
+# sums over a few action dimensions as loops, which are vectorized: written out, every row takes scalar code
+_CPU_OPTIONS: dict[str, Any] = {"unroll_reductions_threshold": 1}
 
 
 def worth_compiling(compile: str, calls: float | None, least_calls: float) -> bool:
@@ -50,6 +52,7 @@ def record(function: Callable[..., Any], inputs: Sequence[Tensor]) -> GraphModul
     with torch.compiler._compile_session_context(), _torchrl_told_so():
         graph = make_fx(function)(*inputs)
     _mask_in_place(graph)
+    _compute_once(graph)
     return graph
 
 
@@ -92,6 +95,34 @@ def _with_dimensions(node: Node) -> list[Node]:
     return [tensor for tensor in node.all_input_nodes if tensor.meta["val"].ndim]
 
 
+def _compute_once(graph: GraphModule) -> None:
+    """Keeps the numbers that larger operations read: inductor's loops for a CPU compute them anew for every vector.
+
+    Adam's bias corrections are two powers for each parameter, and cost more than the rest of its loop.
+    """
+    for node in list(graph.graph.nodes):
+        if node.op == "call_function" and _is_number(node) and any(_is_larger(user) for user in node.users):
+            with graph.graph.inserting_after(node):
+                kept = graph.graph.call_function(torch.ops._inductor_test.realize.default, (node,))
+            kept.meta["val"] = node.meta["val"]
+            node.replace_all_uses_with(kept, delete_user_cb=lambda user, kept=kept: user is not kept)
+    graph.recompile()
+
+
+def _is_number(node: Node) -> bool:
+    """Whether this is an elementwise operation on numbers in a CPU's memory."""
+    x = node.meta.get("val")
+    computed = torch.Tag.pointwise in getattr(node.target, "tags", ())
+    return computed and isinstance(x, Tensor) and x.ndim == 0 and x.is_floating_point() and x.device.type == "cpu"
+
+
+def _is_larger(node: Node) -> bool:
+    """Whether this is an elementwise operation on more than a number."""
+    x = node.meta.get("val")
+    computed = torch.Tag.pointwise in getattr(node.target, "tags", ())
+    return computed and isinstance(x, Tensor) and x.numel() > 1
+
+
 @contextmanager
 def _torchrl_told_so() -> Iterator[None]:
     """TorchRL's losses ask ``is_dynamo_compiling()``, a constant that dynamo alone replaces: here it says yes."""
@@ -113,5 +144,6 @@ def compile_record(graph: GraphModule, inputs: Sequence[Tensor]) -> Callable[...
     """Inductor's code for a recorded graph. It checks nothing: call it with tensors like ``inputs`` and no others."""
     with torch.no_grad():
         options = {**_OPTIONS, "size_asserts": False, "alignment_asserts": False}
+        options |= _CPU_OPTIONS if all(x.device.type == "cpu" for x in inputs) else {}
         code = torch._inductor.compile(graph, list(inputs), options=options)
     return cast(Callable[..., Any], getattr(code, "__wrapped__", code))  # the wrapper only keeps dynamo out
