@@ -107,6 +107,7 @@ PRESETS = {
     "Pendulum-*": dict(
         total_frames=20_000, eval_every=5_000, learning_rate=1e-3, q_learning_rate=1e-3, alpha_learning_rate=1e-3
     ),
+    "HalfCheetah-*": dict(learning_rate=1e-3, q_learning_rate=1e-3, alpha_learning_rate=1e-3),
     "dm_control/*": dict(total_frames=500_000, action_repeat=2),
     "dmc:*": dict(total_frames=500_000, action_repeat=2),
 }

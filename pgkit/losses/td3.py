@@ -38,7 +38,7 @@ class TD3Loss(QLoss):
     Args:
         actor_network: deterministic actor, e.g. :func:`pgkit.modules.deterministic_actor`.
         qvalue_network: critics, as in :class:`~pgkit.losses.QLoss`.
-        action_spec: bounded spec of one action.
+        action_spec: bounded spec of one action, or of the actions ``[num_envs, actions]`` of a vector.
         bounds: ``(low, high)`` in its place.
         policy_noise: :math:`\sigma`, in the unit of the action; a number, or a tensor ``[actions]``.
         noise_clip: :math:`c`, likewise.
@@ -90,7 +90,7 @@ class TD3Loss(QLoss):
                 f"TD3Loss clips its smoothed actions: their spec must be Bounded, this one is {action_spec}"
             )
         space: Any = getattr(action_spec, "space", None)
-        low, high = bounds or (space.low, space.high)
+        low, high = bounds or (x[(0,) * (x.dim() - 1)] for x in (space.low, space.high))  # of a vector: the first's
         numbers = {"min_action": low, "max_action": high, "policy_noise": policy_noise, "noise_clip": noise_clip}
         for name, number in numbers.items():
             self.register_buffer(name, torch.as_tensor(number))

@@ -28,8 +28,8 @@ def observation_size(env: EnvBase, key: str = "observation") -> int:
     shape = observation_shape(env, key)
     if len(shape) != 1:
         raise UserError(
-            f"observation '{key}' has shape {tuple(shape)}, a perceptron needs a flat one: pass encoder= "
-            "(a module from that shape to features) or flatten it in the environment"
+            f"observation '{key}' has shape {tuple(shape)}, a perceptron needs a flat one: flatten it in the "
+            "environment, or pass encoder= (a module from that shape to features) to a builder that takes one"
         )
     return shape[0]
 

@@ -188,8 +188,12 @@ def _program() -> str:
 
 
 def first_match(presets: Presets, env_id: str) -> tuple[str, Mapping[str, Any]]:
-    """The first pattern that fits the env id, and its settings; empty if none does."""
-    fitting = ((pattern, values) for pattern, values in presets.items() if fnmatchcase(env_id, pattern))
+    """The first pattern that fits the env id, and its settings; empty if none does.
+
+    ``HalfCheetah``, which means its latest version, fits ``HalfCheetah-*``.
+    """
+    ids = (env_id, f"{env_id}-")
+    fitting = ((pattern, values) for pattern, values in presets.items() if any(fnmatchcase(x, pattern) for x in ids))
     return next(fitting, ("", {}))
 
 

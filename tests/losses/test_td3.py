@@ -219,5 +219,8 @@ def test_a_spec_may_be_the_actor_s_composite_and_must_have_bounds():
     actor, critics = modules.deterministic_actor(env), modules.q_value(env)
     loss = losses.TD3Loss(actor, critics, action_spec=Composite(action=env.action_spec_unbatched))
     assert loss.max_action == 2 and loss.min_action == -2
+    vector = envs.make("Pendulum-v1", num_envs=3)
+    loss = losses.TD3Loss(actor, critics, action_spec=vector.action_spec)
+    assert loss.max_action.shape == (1,) and loss.max_action == 2
     with pytest.raises(UserError, match="must be Bounded"):
         losses.TD3Loss(actor, critics, action_spec=Unbounded(1))

@@ -53,6 +53,11 @@ def test_the_first_pattern_that_fits_is_the_only_one_used():
     assert (args.learning_rate, args.num_envs) == (0.1, 8)
 
 
+def test_an_id_without_a_version_has_the_preset_of_its_versions():
+    for env_id, seed in (("Hopper", 7), ("Hopper-v5", 7), ("HopperB", 1)):
+        assert parse(Args, {"Hopper-*": {"seed": 7}}, ["--env-id", env_id]).seed == seed
+
+
 def test_the_default_env_has_its_preset_and_an_unknown_one_has_none(capsys: pytest.CaptureFixture[str]):
     assert parse(Args, PRESETS, []).hidden == (32,)
     capsys.readouterr()
