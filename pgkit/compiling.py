@@ -11,7 +11,7 @@ from typing import Any, cast
 
 import torch
 from torch import Tensor
-from torch.compiler import is_dynamo_compiling
+from torch.compiler import is_compiling, is_dynamo_compiling
 from torch.fx import GraphModule, Node
 from torch.fx.experimental.proxy_tensor import make_fx
 
@@ -43,6 +43,15 @@ def worth_compiling(compile: str, calls: float | None, least_calls: float) -> bo
     return calls is None or calls >= least_calls
 
 
+def computed_once(x: Tensor) -> Tensor:
+    """``x`` without gradients, a few numbers that much larger operations read.
+
+    Compiled for a CPU, it is kept in memory: inductor's loops over the larger operations would compute it anew for
+    every vector, and two powers cost more than the rest of Adam.
+    """
+    return torch.ops._inductor_test.realize(x) if is_compiling() and x.device.type == "cpu" else x
+
+
 def record(function: Callable[..., Any], inputs: Sequence[Tensor]) -> GraphModule:
     """The tensor operations of ``function(*inputs)``, gradients and in-place changes included, as a graph.
 
@@ -52,7 +61,6 @@ def record(function: Callable[..., Any], inputs: Sequence[Tensor]) -> GraphModul
     with torch.compiler._compile_session_context(), _torchrl_told_so():
         graph = make_fx(function)(*inputs)
     _mask_in_place(graph)
-    _compute_once(graph)
     return graph
 
 
@@ -93,34 +101,6 @@ def _is_elementwise(node: Node) -> bool:
 def _with_dimensions(node: Node) -> list[Node]:
     """The inputs of an operation that are more than a number."""
     return [tensor for tensor in node.all_input_nodes if tensor.meta["val"].ndim]
-
-
-def _compute_once(graph: GraphModule) -> None:
-    """Keeps the numbers that larger operations read: inductor's loops for a CPU compute them anew for every vector.
-
-    Adam's bias corrections are two powers for each parameter, and cost more than the rest of its loop.
-    """
-    for node in list(graph.graph.nodes):
-        if node.op == "call_function" and _is_number(node) and any(_is_larger(user) for user in node.users):
-            with graph.graph.inserting_after(node):
-                kept = graph.graph.call_function(torch.ops._inductor_test.realize.default, (node,))
-            kept.meta["val"] = node.meta["val"]
-            node.replace_all_uses_with(kept, delete_user_cb=lambda user, kept=kept: user is not kept)
-    graph.recompile()
-
-
-def _is_number(node: Node) -> bool:
-    """Whether this is an elementwise operation on numbers in a CPU's memory."""
-    x = node.meta.get("val")
-    computed = torch.Tag.pointwise in getattr(node.target, "tags", ())
-    return computed and isinstance(x, Tensor) and x.ndim == 0 and x.is_floating_point() and x.device.type == "cpu"
-
-
-def _is_larger(node: Node) -> bool:
-    """Whether this is an elementwise operation on more than a number."""
-    x = node.meta.get("val")
-    computed = torch.Tag.pointwise in getattr(node.target, "tags", ())
-    return computed and isinstance(x, Tensor) and x.numel() > 1
 
 
 @contextmanager

@@ -18,6 +18,8 @@ from torch.optim.adam import adam
 from torch.optim.rmsprop import rmsprop
 from torch.optim.sgd import sgd
 
+from pgkit.compiling import computed_once
+
 Apply = Callable[[list[Tensor]], None]
 
 
@@ -123,12 +125,32 @@ def _adam(optimizer: Optimizer, group: dict[str, Any], lr: Tensor, fused: bool) 
     beta1, beta2 = group["betas"]
 
     def apply(grads: list[Tensor]) -> None:
+        if is_compiling():
+            traced(grads)
+            return
         adam(
             group["params"], grads, averages, squares, maxima[0] if maxima else [], steps,
-            foreach=False, fused=fused, capturable=is_compiling(), amsgrad=group["amsgrad"], beta1=beta1, beta2=beta2,
+            foreach=False, fused=fused, amsgrad=group["amsgrad"], beta1=beta1, beta2=beta2,
             lr=lr, weight_decay=group["weight_decay"], eps=group["eps"], maximize=group["maximize"],
             decoupled_weight_decay=group.get("decoupled_weight_decay", False),
         )  # fmt: skip
+
+    def traced(grads: list[Tensor]) -> None:  # the same, with the bias corrections of all parameters at once
+        counts = torch.stack([step.add_(1) for step in steps])
+        rates = computed_once(lr / (1 - beta1**counts))
+        roots = computed_once((1 - beta2**counts).sqrt())
+        decay, decoupled = group["weight_decay"], group.get("decoupled_weight_decay", False)
+        for i, (p, grad, average, square) in enumerate(zip(group["params"], grads, averages, squares, strict=True)):
+            grad = -grad if group["maximize"] else grad
+            if decay and decoupled:
+                p.mul_(1 - lr * decay)
+            elif decay:
+                grad = grad + decay * p
+            average.lerp_(grad, 1 - beta1)
+            square.mul_(beta2).addcmul_(grad, grad, value=1 - beta2)
+            if maxima:
+                square = maxima[0][i].copy_(torch.maximum(maxima[0][i], square))
+            p.sub_(rates[i] * average / (square.sqrt() / roots[i] + group["eps"]))
 
     return apply
 

@@ -14,6 +14,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
+from pgkit.compiling import computed_once
 from pgkit.updates import optimizers
 from pgkit.updates.chain import is_loss
 from pgkit.updates.recorded import Step, recorded
@@ -88,7 +89,7 @@ class GradientStep:
                     write_back(data, index, batch)
                 norm = torch.stack([grad.square().sum() for grad in grads]).sum().sqrt()
                 if max_grad_norm is not None:
-                    factor = (max_grad_norm / (norm + 1e-6)).clamp(max=1.0)
+                    factor = computed_once((max_grad_norm / (norm + 1e-6)).clamp(max=1.0))
                     grads = [grad * factor for grad in grads]
                 if apply is not None:
                     apply(grads)

@@ -141,19 +141,3 @@ def test_other_indices_are_left_alone(where):
 
     graph = record(lambda *inputs: [assign(*inputs)], [x, mask])
     torch.testing.assert_close(graph(x, mask)[0], assign(x, mask))
-
-
-def test_a_number_is_computed_once_and_not_for_every_vector():
-    def corrected(step, x):
-        step.add_(1)
-        return [x / (1 - 0.9**step), step * 2]
-
-    x = torch.randn(64)
-    graph = record(corrected, [torch.zeros(()), x])
-    kept = [n for n in graph.graph.nodes if n.target is torch.ops._inductor_test.realize.default]
-    assert len(kept) == 1 and kept[0].args[0].target is torch.ops.aten.rsub.Scalar  # the last number of its chain
-    code, step = compile_record(graph, [torch.zeros(()), x]), torch.zeros(())
-    for count in (1, 2, 3):
-        out, double = code(step, x)
-        torch.testing.assert_close(out, x / (1 - 0.9**count))
-        assert double == 2 * count
