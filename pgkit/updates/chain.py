@@ -61,6 +61,15 @@ class Chain:
         """Names of the loss's networks that take ``key`` as an input."""
         return [name for name, (net, _) in self.networks().items() if key in net.in_keys]
 
+    def reads(self) -> list[Any]:
+        """The loss's ``in_keys``; of a loss without any, what its networks and a one-step target read."""
+        if named := getattr(self.loss, "in_keys", None):
+            return list(named)
+        inputs = [key for net, _ in self.networks().values() for key in net.in_keys]
+        after = [*inputs, *(self.key(name) for name in ("reward", "done", "terminated"))]
+        keys = [*inputs, self.key("action"), *(("next", key) for key in after if key)]
+        return [key for key in dict.fromkeys(keys) if key]
+
     def key(self, name: str) -> Any:
         """The entry that the loss knows as ``name`` (its ``tensor_keys``), or None."""
         return getattr(getattr(self.loss, "tensor_keys", None), name, None)

@@ -39,7 +39,7 @@ def diagram(update: Any, chain: Chain, step: str, batch: TensorDictBase | None =
 def _table(chain: Chain, batch: TensorDictBase | None) -> list[str]:
     block = chain.advantage
     before, after = getattr(block, "in_keys", []), getattr(block, "out_keys", [])
-    read = [key for key in getattr(chain.loss, "in_keys", None) or [] if not (block and _is_next(key))]
+    read = [key for key in chain.reads() if not (block and _is_next(key))]
     read += [key for key in map(chain.key, ("advantage", "value_target")) if key in after]
     keys = [key for key in dict.fromkeys([*read, *before, *after]) if key != "_"]
     keys.sort(key=lambda key: (key in after, _is_next(key)))

@@ -5,8 +5,11 @@ import sys
 
 import pytest
 import torch
+from tensordict.nn import TensorDictModule
+from torchrl.modules import DistributionalQValueActor
+from torchrl.objectives import DistributionalDQNLoss
 
-from pgkit import losses, modules, updates
+from pgkit import data, envs, losses, modules, updates
 from pgkit.errors import UserError
 from tests.updates.mistakes import MISTAKES, PAGE, Agent, ReplayAgent, message, page, section
 
@@ -80,6 +83,18 @@ def test_the_diagram_of_a_replay_agent():
     update = updates.OffPolicyUpdate(agent.loss, agent.buffer, torch.optim.Adam(agent.loss.parameters()), **sizes)
     text = str(update)
     assert "SACLoss, gamma 0.99" in text and "loss_actor + loss_qvalue + loss_alpha" in text and "ReplayBuffer" in text
+
+
+def test_the_diagram_of_a_loss_that_names_no_in_keys():
+    env = envs.make("CartPole-v1")
+    net = TensorDictModule(lambda x: x, in_keys=["observation"], out_keys=["action_value"])
+    actor = DistributionalQValueActor(net, support=torch.linspace(0, 1, 4), action_space="categorical")
+    loss = DistributionalDQNLoss(actor, gamma=0.9)
+    assert not hasattr(loss, "in_keys")
+    text = str(updates.OffPolicyUpdate(loss, data.ReplayBuffer(env, 1000), torch.optim.Adam([torch.zeros(1)])))
+    rows = [line.split()[0] for line in text.partition("entry")[2].splitlines()[1:]]
+    after = ["next.observation", "next.reward", "next.done", "next.terminated"]
+    assert rows == ["observation", "action", *after]
 
 
 @pytest.mark.parametrize("recipe", ["ppo", "sac"])
