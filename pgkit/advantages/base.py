@@ -9,6 +9,8 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor
 
+from pgkit.functional import standardize
+
 
 class Advantage(TensorDictModuleBase):
     """Base of the estimators: writes ``advantage`` and ``value_target`` (``[*B, T, 1]``) into a rollout ``[*B, T]``.
@@ -60,7 +62,7 @@ class Advantage(TensorDictModuleBase):
             rollout.set("state_value", value)
         advantage, target = self.estimate(value * scale, next_value * scale, rollout)
         if self.standardize:
-            advantage = (advantage - advantage.mean()) / advantage.std().clamp_min(1e-6)
+            advantage = standardize(advantage)
         rollout.set("advantage", advantage)
         rollout.set("value_target", target / scale)
         return rollout
@@ -70,8 +72,8 @@ class Advantage(TensorDictModuleBase):
         own = rollout["next", "done"].squeeze(-1).clone()  # steps whose successor is not the next entry
         own[..., -1] = True
         if torch.compiler.is_compiling():  # shapes may not depend on the data: the critic reads all next ones
-            both = torch.cat([rollout.select(*critic.in_keys), rollout["next"].select(*critic.in_keys)])
-            value, after = critic(both)[critic.out_keys[0]].chunk(2)
+            both = torch.cat([x.select(*critic.in_keys).reshape(-1) for x in (rollout, rollout["next"])])
+            value, after = critic(both)[critic.out_keys[0]].reshape(2, *rollout.batch_size, 1)
             return value, torch.where(own.unsqueeze(-1), after, torch.cat([value[..., 1:, :], after[..., -1:, :]], -2))
         rows, dims = rollout.numel(), rollout.batch_dims
         both = {

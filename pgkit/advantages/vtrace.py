@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule
+from tensordict.nn import CompositeDistribution, TensorDictModule, set_composite_lp_aggregate
 from tensordict.utils import NestedKey
 from torch import Tensor
 
@@ -31,7 +31,8 @@ class VTrace(Advantage):
         rho_thresh: bound of the importance weight of a step.
         c_thresh: bound of the weight that carries a later step's error back.
         log_prob_key: the present policy's log-probability, ``[*B, T]``.
-        sample_log_prob: the collecting policy's.
+        sample_log_prob: the collecting policy's; by default what the actor writes, ``action_log_prob`` without one.
+            Of a composite action a list: its parts are added up.
     """
 
     lmbda: Tensor
@@ -46,24 +47,35 @@ class VTrace(Advantage):
         rho_thresh: float = 1.0,
         c_thresh: float = 1.0,
         log_prob_key: NestedKey = "current_log_prob",
-        sample_log_prob: NestedKey = "action_log_prob",
+        sample_log_prob: NestedKey | list[NestedKey] | None = None,
         standardize: bool = False,
         return_scale: Any = None,
     ) -> None:
         super().__init__(critic, gamma=gamma, standardize=standardize, return_scale=return_scale)
         self.register_buffer("lmbda", torch.tensor(float(lmbda)))
         self.actor, self.rho_thresh, self.c_thresh = actor, rho_thresh, c_thresh
+        if sample_log_prob is None:
+            sample_log_prob = "action_log_prob" if actor is None else list(actor.log_prob_keys)
         self.log_prob_key, self.sample_log_prob = log_prob_key, sample_log_prob
-        self.in_keys += [sample_log_prob, *([log_prob_key] if actor is None else [*actor.dist_sample_keys])]
+        reads = [log_prob_key] if actor is None else [*actor.in_keys, *actor.dist_sample_keys]
+        self.in_keys = list(dict.fromkeys([*self.in_keys, *_listed(sample_log_prob), *reads]))
         self.out_keys += [] if actor is None else [log_prob_key]
 
     def estimate(self, value: Tensor, next_value: Tensor, rollout: TensorDictBase) -> tuple[Tensor, Tensor]:
         if self.actor is not None:
             dist = self.actor.get_dist(rollout.select(*self.actor.in_keys))
-            rollout.set(self.log_prob_key, dist.log_prob(rollout[self.actor.dist_sample_keys[0]]))
-        log_prob, old_log_prob = rollout[self.log_prob_key], rollout[self.sample_log_prob]
+            composite = isinstance(dist, CompositeDistribution)
+            with set_composite_lp_aggregate(True):
+                actions = rollout if composite else rollout[self.actor.dist_sample_keys[0]]
+                rollout.set(self.log_prob_key, dist.log_prob(actions))
+        log_prob = rollout[self.log_prob_key]
+        old_log_prob = torch.stack([rollout[key] for key in _listed(self.sample_log_prob)]).sum(0)
         same_shape(log_prob=log_prob, old_log_prob=old_log_prob)
         return vtrace(
             (log_prob - old_log_prob).unsqueeze(-1), value, next_value, *ends(rollout),
             self.gamma, self.lmbda, self.rho_thresh, self.c_thresh,
         )  # fmt: skip
+
+
+def _listed(keys: Any) -> list[NestedKey]:
+    return keys if isinstance(keys, list) else [keys]

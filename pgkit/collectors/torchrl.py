@@ -44,14 +44,16 @@ class TorchRLCollector:
             size = state["recurrent_state"].shape[-1]
             transforms += [InitTracker(), TensorDictPrimer(recurrent_state=Unbounded((size,)), expand_specs=True)]
         env = TransformedEnv(env, Compose(*transforms))
-        self.frames, self.compile_seconds = 0, 0.0
+        self.frames, self.total_frames, self.compile_seconds = 0, total_frames, 0.0
         kwargs = {"trust_policy": True, "auto_register_policy_transforms": True} | kwargs
         self.collector = Collector(env, actor, frames_per_batch=frames_per_batch, total_frames=total_frames, **kwargs)
 
     def __iter__(self) -> Iterator[TensorDictBase]:
-        for rollout in self.collector:
+        for rollout in self.collector:  # which counts from 0 again after a resume
             self.frames += rollout.numel()
             yield rollout
+            if 0 <= self.total_frames <= self.frames:
+                break
 
     def state_dict(self) -> dict[str, Any]:
         """Frames so far; TorchRL's environments start new episodes on a resume."""

@@ -58,6 +58,7 @@ class VectorEnv(EnvBase):
             spec = Unbounded((num_envs, *self.observation_shape), dtype=torch.float32)
             self.observation_spec = Composite(observation=spec, shape=(num_envs,))
         self.action_spec = action_spec(probe.action_space, num_envs)
+        self.action_start = getattr(probe.action_space, "start", 0)  # of Gymnasium's discrete spaces; the spec's is 0
         self.reward_spec = Unbounded((num_envs, 1), dtype=torch.float32)
         flag = Categorical(2, shape=(num_envs, 1), dtype=torch.bool)
         self.done_spec = Composite(done=flag, terminated=flag, truncated=flag, shape=(num_envs,))

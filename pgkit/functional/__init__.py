@@ -33,7 +33,7 @@ from pgkit.functional.surrogates import (
     rollback_surrogate,
 )
 from pgkit.functional.td_lambda import from_start, lambda_return, n_step_return
-from pgkit.functional.values import clipped_value_loss, explained_variance, value_loss
+from pgkit.functional.values import clipped_value_loss, explained_variance, standardize, value_loss
 from pgkit.functional.vtrace import vtrace
 
 __all__ = [
@@ -67,6 +67,7 @@ __all__ = [
     "same_shape",
     "smoothed_action",
     "soft_returns",
+    "standardize",
     "straight_through_sample",
     "temperature_loss",
     "twin_minimum",

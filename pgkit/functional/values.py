@@ -1,4 +1,4 @@
-"""Losses of value functions, unreduced."""
+"""Losses of value functions, unreduced, and what makes numbers comparable."""
 
 from __future__ import annotations
 
@@ -33,6 +33,18 @@ def clipped_value_loss(
     same_shape(value=value, old_value=old_value)
     clipped = old_value + (value - old_value).clamp(-clip, clip)
     return torch.maximum(value_loss(value, target, kind), value_loss(clipped, target, kind))
+
+
+def standardize(x: Tensor, mask: Tensor | None = None) -> Tensor:
+    """``x`` with zero mean and unit deviation over its elements, or over those of ``mask``, of its shape.
+
+    A single element becomes zero; a deviation below 1e-6 counts as that.
+    """
+    weight = torch.ones_like(x) if mask is None else mask.to(x.dtype)
+    count = weight.sum()
+    centered = x - (weight * x).sum() / count
+    deviation = ((weight * centered.square()).sum() / (count - 1).clamp_min(1)).sqrt()
+    return centered / deviation.clamp_min(1e-6)
 
 
 def explained_variance(value: Tensor, target: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torch.distributions import Distribution
 
-from pgkit.functional import clipped_value_loss, explained_variance, value_loss
+from pgkit.functional import clipped_value_loss, explained_variance, standardize, value_loss
 from pgkit.losses.policy_base import PolicyLoss
 
 
@@ -62,10 +62,10 @@ class ActorCriticLoss(PolicyLoss):
 
     def get_advantage(self, batch: TensorDictBase) -> Tensor:
         """The batch's advantage ``[*B, 1]``, standardized over the batch if this loss does that."""
-        advantage = super().get_advantage(batch)
-        if self.normalize_advantage and advantage.numel() > 1:
-            return (advantage - advantage.mean()) / advantage.std().clamp_min(1e-6)
-        return advantage
+        advantage, mask = super().get_advantage(batch), batch.get(("collector", "mask"), None)
+        if not self.normalize_advantage:
+            return advantage
+        return standardize(advantage, None if mask is None else mask.reshape(advantage.shape))
 
     def add_entropy(self, out: TensorDict, dist: Distribution, batch: TensorDictBase) -> None:
         """Writes ``loss_entropy`` and ``entropy``, unless there is no entropy bonus."""

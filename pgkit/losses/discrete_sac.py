@@ -136,6 +136,8 @@ class DiscreteSACLoss(SoftQLoss):
 
 def _chosen(q: Tensor, action: Tensor) -> Tensor:
     """Of ``q [*B, critics, actions]`` the action's, ``[*B, critics]``; the action is an index ``[*B]`` or one-hot."""
+    if action.dim() == q.dim() - 1 and action.shape[-1] != q.shape[-1]:  # indices [*B, 1]
+        action = action.squeeze(-1)
     if action.dim() == q.dim() - 2:
         index = action.reshape(*action.shape, 1, 1).expand(*q.shape[:-1], 1)
         return q.gather(-1, index).squeeze(-1)

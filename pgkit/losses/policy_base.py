@@ -66,13 +66,15 @@ class PolicyLoss(Loss):
         else:
             shared = list(actor_network.parameters()) if separate_losses else None
             self.convert_to_functional(critic_network, "critic_network", compare_against=shared)
-        action, log_prob = actor_network.dist_sample_keys, actor_network.log_prob_keys
-        self.set_keys(action=action[0], sample_log_prob=log_prob[0])
+        several = (list(actor_network.dist_sample_keys), list(actor_network.log_prob_keys))
+        action, log_prob = (keys[0] if len(keys) == 1 else keys for keys in several)
+        self.set_keys(action=action, sample_log_prob=log_prob)
 
     def distribution(self, batch: TensorDictBase) -> Distribution:
         """The policy's distribution at the batch's observations; the batch is left as it is."""
         with self.actor_network_params.to_module(self.actor_network):
-            return self.actor_network.get_dist(batch.select(*self.actor_network.in_keys))
+            entries = batch.select(*self.actor_network.in_keys, strict=False)  # a composite's "params" it writes itself
+            return self.actor_network.get_dist(entries)
 
     def log_prob(self, dist: Distribution, batch: TensorDictBase) -> Tensor:
         """Log-probability of the batch's actions, ``[*B]``; of a composite action, that of all its parts.
@@ -82,7 +84,7 @@ class PolicyLoss(Loss):
                 cancel part of the loss's.
         """
         for key in listed(self.tensor_keys.action):
-            if batch.get(key).requires_grad:
+            if batch[key].requires_grad:
                 raise RuntimeError(
                     f"tensordict stored {key} requires grad: collect under torch.no_grad(), or give the loss "
                     "rollout.detach()"
@@ -134,7 +136,7 @@ class PolicyLoss(Loss):
         assert self.critic_network is not None
         with self.critic_network_params.to_module(self.critic_network):
             out = self.critic_network(batch.select(*self.critic_network.in_keys))
-        return out.get(self.tensor_keys.value)
+        return out[self.tensor_keys.value]
 
     def entropy(self, dist: Distribution) -> Tensor:
         """Entropy ``[*B]``: in closed form, or minus the mean log-probability of ``samples_mc_entropy`` draws."""

@@ -11,7 +11,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
-from torchrl.data import TensorSpec
+from torchrl.data import Composite, TensorSpec
 
 from pgkit.errors import UserError
 from pgkit.functional import ensemble_mean, random_subset, temperature_loss, twin_minimum
@@ -90,6 +90,8 @@ class SoftQLoss(QLoss):
         self._log_bounds = (log(min_alpha) if min_alpha else None, log(max_alpha) if max_alpha else None)
         self.fixed_alpha, self.loss_function = fixed_alpha, loss_function
         self._target_entropy = None if target_entropy == "auto" else float(target_entropy)
+        if isinstance(action_spec, Composite):
+            action_spec = action_spec[self.tensor_keys.action]
         if self._target_entropy is None and action_spec is not None:
             self._target_entropy = -float(action_spec.shape[-1:].numel())
 

@@ -42,6 +42,11 @@ def box_action(env: EnvBase, needs_bounds: bool = False) -> TensorSpec:
             f"the action space is discrete ({spec.__class__.__name__}): use modules.categorical_actor and "
             "modules.discrete_q_value; the recipes for it are discrete_sac, dqn, rainbow and ppo"
         )
+    if len(spec.shape) != 1:
+        raise UserError(
+            f"actions have shape {tuple(spec.shape)}, the actors here write flat ones: flatten them in the environment "
+            "(gymnasium.wrappers.TransformAction)"
+        )
     if needs_bounds and not isinstance(spec, Bounded):
         raise UserError("the action space has no bounds to squash into: use modules.gaussian_actor, or bound the Box")
     return spec

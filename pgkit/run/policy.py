@@ -20,8 +20,8 @@ Which = Literal["best", "latest"]
 class Policy:
     """A policy with its observation normalizer, and the env it was trained for.
 
-    ``low`` and ``high`` are the action bounds ``[*action]``, None for discrete actions. ``observation_shape`` is a
-    mapping from names to shapes where the policy reads the entries of a Dict.
+    ``low`` and ``high`` are the action bounds ``[*action]``, None for discrete actions, which begin at ``start``.
+    ``observation_shape`` is a mapping from names to shapes where the policy reads the entries of a Dict.
     """
 
     actor: torch.nn.Module
@@ -30,6 +30,7 @@ class Policy:
     low: np.ndarray | None
     high: np.ndarray | None
     frames: int = 0
+    start: Any = 0
 
     def __post_init__(self) -> None:
         self._acting = Acting(self.actor)
@@ -64,6 +65,8 @@ class Policy:
         self._begins = False
         if self.low is not None and self.high is not None:
             action = np.clip(action, self.low, self.high)
+        elif np.any(self.start):
+            action = action + self.start
         return action[0] if single else action
 
 
@@ -76,6 +79,7 @@ def describe_env(env: Any) -> dict[str, Any]:
         "observation_shape": shapes["observation"] if list(shapes) == ["observation"] else shapes,
         "low": None if low is None else low.cpu().numpy(),
         "high": None if high is None else high.cpu().numpy(),
+        "start": getattr(env, "action_start", 0),
     }
 
 

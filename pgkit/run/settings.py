@@ -55,7 +55,9 @@ _BOUNDS: dict[str, tuple[float, float]] = {
     **dict.fromkeys(("total_frames", "num_envs", "workers", "eval_episodes", "threads"), (1, math.inf)),
     **dict.fromkeys(("steps", "epochs", "minibatch_size", "batch_size", "n_step", "buffer_size"), (1, math.inf)),
     **dict.fromkeys(("actor_delay", "action_repeat", "log_every", "num_critics", "atoms", "bins"), (1, math.inf)),
-    **dict.fromkeys(("hidden", "critic_hidden"), (1, math.inf)),
+    **dict.fromkeys(("hidden", "critic_hidden", "sequence_length", "memory_size"), (1, math.inf)),
+    **dict.fromkeys(("cg_steps", "critic_epochs"), (1, math.inf)),
+    **dict.fromkeys(("replay", "delay", "backtracks", "damping", "max_kl", "kl_target", "beta"), (0, math.inf)),
     **dict.fromkeys(("seed", "eval_every", "random_frames", "updates_per_step", "max_grad_norm"), (0, math.inf)),
     **dict.fromkeys(("learning_rate", "q_learning_rate", "alpha_learning_rate", "clip_epsilon"), (0, math.inf)),
     **dict.fromkeys(("gamma", "lmbda", "tau"), (0, 1)),
@@ -167,7 +169,7 @@ def check(args: RunArgs) -> None:
     for name, (least, most) in _BOUNDS.items():
         value = getattr(args, name, None)
         for number in value if isinstance(value, tuple) else (value,):
-            if number is not None and not least <= number <= most:
+            if isinstance(number, int | float) and not least <= number <= most:
                 bound = f"at least {least:g}" if number < least else f"at most {most:g}"
                 raise UserError(f"--{name.replace('_', '-')} {number}: give {bound}")
 

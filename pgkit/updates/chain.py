@@ -66,26 +66,37 @@ class Chain:
         if named := getattr(self.loss, "in_keys", None):
             return list(named)
         inputs = [key for net, _ in self.networks().values() for key in net.in_keys]
-        after = [*inputs, *(self.key(name) for name in ("reward", "done", "terminated"))]
-        keys = [*inputs, self.key("action"), *(("next", key) for key in after if key)]
-        return [key for key in dict.fromkeys(keys) if key]
+        actions = self.keys("action")
+        after = [key for key in inputs if key not in actions]
+        after += [key for name in ("reward", "done", "terminated") for key in self.keys(name)]
+        return list(dict.fromkeys([*inputs, *actions, *map(following, after)]))
 
     def key(self, name: str) -> Any:
         """The entry that the loss knows as ``name`` (its ``tensor_keys``), or None."""
         return getattr(getattr(self.loss, "tensor_keys", None), name, None)
+
+    def keys(self, name: str) -> list[Any]:
+        """The entries of :meth:`key`: none, one, or those of a composite action's parts."""
+        key = self.key(name)
+        return key if isinstance(key, list) else [] if key is None else [key]
 
     def distribution(self, batch: TensorDictBase) -> Any:
         """The actor's distribution at the batch's observations; None for an actor without one."""
         net, params = self.networks().get("actor_network", (None, None))
         if not hasattr(net, "get_dist"):
             return None
-        return run(net, params, lambda: net.get_dist(batch.select(*net.in_keys)))
+        return run(net, params, lambda: net.get_dist(batch.select(*net.in_keys, strict=False)))
 
 
 def run(net: Any, params: Any, call: Callable[[], Any]) -> Any:
     """``call()`` with ``params`` in ``net``, without gradients and without a trace on the random generator."""
     with torch.no_grad(), torch.random.fork_rng(devices=[]), params.to_module(net, preserve_module_state=False):
         return call()
+
+
+def following(key: Any) -> tuple[str, ...]:
+    """The key of the same entry one step on."""
+    return ("next", *((key,) if isinstance(key, str) else key))
 
 
 def show(key: Any) -> str:

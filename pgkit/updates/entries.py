@@ -9,7 +9,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from pgkit.errors import UserError
-from pgkit.updates.chain import Chain, run, shape, show
+from pgkit.updates.chain import Chain, following, run, shape, show
 
 WITH_A_TRAILING_1 = ("advantage", "value_target", "value")
 OF_THE_NEXT_STATE = ("reward", "done", "terminated")
@@ -17,21 +17,20 @@ OF_THE_NEXT_STATE = ("reward", "done", "terminated")
 
 def check_form(chain: Chain, batch: TensorDictBase) -> None:
     """What a loss may take without a word and get wrong: ``(B,)`` for ``(B, 1)``, numbers for flags."""
-    keys = [chain.key(name) for name in WITH_A_TRAILING_1]
-    keys += [("next", *((key,) if isinstance(key, str) else key)) for key in map(chain.key, OF_THE_NEXT_STATE) if key]
+    keys = [key for name in WITH_A_TRAILING_1 for key in chain.keys(name)]
+    keys += [following(key) for name in OF_THE_NEXT_STATE for key in chain.keys(name)]
     size = tuple(batch.batch_size)
     for key in keys:
-        x = batch.get(key, None) if key else None
+        x = batch.get(key, None)
         if isinstance(x, Tensor) and tuple(x.shape) == size:
             raise _wrong(chain, key, shape(x), str((*size, 1)), "keep the trailing 1, unsqueeze(-1)")
-    key = chain.key("sample_log_prob")
-    x = batch.get(key, None) if key else None
-    if isinstance(x, Tensor) and tuple(x.shape) == (*size, 1):
-        advice = "one number a row, squeeze(-1), or a distribution over the whole action (IndependentNormal)"
-        raise _wrong(chain, key, shape(x), str(size), advice)
-    for name in ("done", "terminated"):
-        key = ("next", chain.key(name))
-        x = batch.get(key, None) if isinstance(key[1], str) else None
+    for key in chain.keys("sample_log_prob"):
+        x = batch.get(key, None)
+        if isinstance(x, Tensor) and tuple(x.shape) == (*size, 1):
+            advice = "one number a row, squeeze(-1), or a distribution over the whole action (IndependentNormal)"
+            raise _wrong(chain, key, shape(x), str(size), advice)
+    for key in map(following, [*chain.keys("done"), *chain.keys("terminated")]):
+        x = batch.get(key, None)
         if isinstance(x, Tensor) and x.dtype != torch.bool:
             raise _wrong(chain, key, _type(x), "bool", "make it a flag, x.bool()")
 
@@ -59,7 +58,8 @@ def explain(chain: Chain, batch: TensorDictBase, error: Exception) -> str | None
 
 def wrong_action(chain: Chain, batch: TensorDictBase) -> str | None:
     """The batch's actions against the actor's distribution: their kind, shape and bounds; None if all is well."""
-    key, dist = chain.key("action"), chain.distribution(batch)
+    keys, dist = chain.keys("action"), chain.distribution(batch)
+    key = keys[0] if len(keys) == 1 else None
     action = batch.get(key, None) if key else None
     if dist is None or not isinstance(action, Tensor):
         return None
@@ -93,7 +93,7 @@ def check_values(chain: Chain, batch: TensorDictBase, out: TensorDictBase, losse
     for key in getattr(chain.loss, "in_keys", batch.keys(True, True)):
         x = batch.get(key, None)
         if isinstance(x, Tensor) and not x.isfinite().all():
-            random = "; frames collected with random actions have no log-probability" if key == _log_prob(chain) else ""
+            random = "; frames collected with random actions have no log-probability" * (key in _log_prob(chain))
             raise UserError(
                 f"'{show(key)}' has {int((~x.isfinite()).sum())} of {x.numel()} values that are not finite, expected "
                 f"none by {chain.reader(key)}, whose '{bad[0]}' is {out[bad[0]].sum():g}; written by "
@@ -105,8 +105,8 @@ def check_values(chain: Chain, batch: TensorDictBase, out: TensorDictBase, losse
     )
 
 
-def _log_prob(chain: Chain) -> Any:
-    return chain.key("sample_log_prob")
+def _log_prob(chain: Chain) -> list[Any]:
+    return chain.keys("sample_log_prob")
 
 
 def _read(chain: Chain) -> list[Any]:
@@ -146,7 +146,7 @@ def _missing(chain: Chain, batch: TensorDictBase, key: Any, reader: str) -> str:
         else:
             written = ", ".join(show(k) for k in getattr(chain.advantage, "out_keys", ())) or "unknown entries"
             advice = f"{type(chain.advantage).__name__} writes {written}: use one name, or loss.set_keys(...)"
-    elif key == _log_prob(chain):
+    elif key in _log_prob(chain):
         advice = "the actor should write it: build it with return_log_prob=True"
     else:
         advice = f"{chain.origin(key)} should write it: use one name, or loss.set_keys(...), or in_keys=[...]"

@@ -15,6 +15,7 @@ from torch.optim import Optimizer
 
 from pgkit.compiling import worth_compiling
 from pgkit.errors import UserError
+from pgkit.functional import standardize
 from pgkit.updates import wiring
 from pgkit.updates.chain import Chain
 from pgkit.updates.diagram import diagram
@@ -68,6 +69,13 @@ class OnPolicyUpdate:
     ) -> None:
         if schedules and total_frames is None:
             raise UserError("schedules are functions of the progress: give total_frames too")
+        for name in schedules or {}:
+            if name != "lr" and not isinstance(getattr(loss, name, None), Tensor):
+                names = sorted(getattr(loss, "_schedulable_buffers", ()))
+                known = ["lr", *[key for key in names if isinstance(getattr(loss, key, None), Tensor)]]
+                raise UserError(
+                    f"schedules: {type(loss).__name__} has no coefficient '{name}', only {', '.join(known)}"
+                )
         if normalize_advantage and getattr(loss, "normalize_advantage", False):
             raise UserError(
                 f"{type(loss).__name__} normalizes the advantage already: leave normalize_advantage out here"
@@ -186,7 +194,7 @@ class OnPolicyUpdate:
             self.optimizer,
             names,
             max_grad_norm=self.max_grad_norm,
-            before=_standardize_advantage if self.normalize_advantage else None,
+            before=self._standardize_advantage if self.normalize_advantage else None,
             compile=worth_compiling(self.compile, steps, least_calls=30_000),
             may_fall_back=self.compile == "auto",
         )
@@ -207,7 +215,6 @@ class OnPolicyUpdate:
             raise UserError(f"target_kl needs a loss that reports approx_kl; {type(self.loss).__name__} does not")
         return float(torch.stack(results).mean(0)[self._step.names.index(names[0])])
 
-
-def _standardize_advantage(batch: TensorDictBase) -> TensorDictBase:
-    advantage = batch["advantage"]
-    return batch.copy().set("advantage", (advantage - advantage.mean()) / advantage.std().clamp_min(1e-6))
+    def _standardize_advantage(self, batch: TensorDictBase) -> TensorDictBase:
+        key = getattr(getattr(self.loss, "tensor_keys", None), "advantage", "advantage")
+        return batch.copy().set(key, standardize(batch[key]))

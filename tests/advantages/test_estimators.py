@@ -9,6 +9,8 @@ from torchrl.objectives.value import TDLambdaEstimator
 from torchrl.objectives.value.functional import vtrace_advantage_estimate
 
 from pgkit import advantages, collectors, envs, modules
+from pgkit.compiling import record
+from tests.modules.test_discrete import Masked
 
 
 @pytest.fixture(scope="module")
@@ -146,3 +148,31 @@ def test_one_interface(agent):
         plain = block(rollout.copy())
         assert_close(scaled["advantage"], plain["advantage"])
         assert_close(scaled["value_target"] * 3, plain["value_target"])
+
+
+def test_a_recorded_recurrent_critic_starts_afresh_at_every_end():
+    torch.manual_seed(0)
+    env = envs.make("pgkit/TMaze-v0", num_envs=4, length=2)
+    core = modules.gru(env, 8, (8,))
+    actor, critic = modules.categorical_actor(env, encoder=core), modules.state_value(env, encoder=core)
+    rollout = collectors.VectorCollector(env, actor, frames_per_batch=4 * 8, compile="off").rollout()
+    assert rollout["next", "done"][:, :-1].any()
+    block = advantages.GAE(critic)
+    entries = [rollout[key] for key in block.in_keys]
+
+    def flat(*entries):
+        data = TensorDict({}, rollout.batch_size)
+        for key, x in zip(block.in_keys, entries, strict=True):
+            data.set(key, x)
+        return [block(data)["advantage"]]
+
+    torch.testing.assert_close(record(flat, entries)(*entries)[0], block(rollout.clone())["advantage"])
+
+
+def test_vtrace_names_what_its_actor_reads():
+    env = envs.make(Masked, num_envs=2, flatten=False)
+    actor = modules.categorical_actor(env)
+    block = advantages.VTrace(modules.state_value(env), actor)
+    rollout = collectors.VectorCollector(env, actor, frames_per_batch=12, compile="off").rollout()
+    assert "action_mask" in block.in_keys and len(set(block.in_keys)) == len(block.in_keys)
+    assert block(rollout.select(*block.in_keys))["advantage"].shape == (2, 6, 1)

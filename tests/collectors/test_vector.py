@@ -184,3 +184,10 @@ def test_torchrl_collector_gives_the_same_seam():
     done = rollouts[0]["next", "done"]
     lengths = rollouts[0]["next", "step_count"][done]
     assert torch.equal(rollouts[0]["next", "episode_reward"][done], lengths.float())
+
+
+def test_torchrl_collector_ends_at_total_frames_after_a_resume():
+    env = envs.make("CartPole-v1", num_envs=2, seed=1)
+    collector = collectors.TorchRLCollector(env, modules.categorical_actor(env), frames_per_batch=20, total_frames=100)
+    collector.load_state_dict({"frames": 60})
+    assert [collector.frames for _ in collector] == [80, 100]

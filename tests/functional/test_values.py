@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from pgkit.functional import clipped_value_loss, explained_variance, value_loss
+from pgkit.functional import clipped_value_loss, explained_variance, standardize, value_loss
 
 
 def test_squared_error_has_no_half():
@@ -25,3 +25,12 @@ def test_explained_variance():
     assert explained_variance(target, target).item() == 1.0
     assert explained_variance(torch.full((4,), 2.5), target).item() == pytest.approx(0.0)
     assert explained_variance(-target, target).item() == pytest.approx(-3.0)
+
+
+def test_standardize():
+    x = torch.tensor([[1.0], [2.0], [6.0], [50.0]])
+    torch.testing.assert_close(standardize(x), (x - x.mean()) / x.std())
+    mask = torch.tensor([[True], [True], [True], [False]])
+    torch.testing.assert_close(standardize(x, mask)[:3], (x[:3] - 3) / x[:3].std())
+    assert standardize(x[:1]).item() == 0  # one row has no deviation
+    assert standardize(torch.full((3,), 7.0)).tolist() == [0, 0, 0]

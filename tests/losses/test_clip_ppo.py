@@ -9,7 +9,7 @@ from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import ClipPPOLoss as TorchRLClipPPOLoss
 from torchrl.objectives.utils import ValueEstimators
 
-from pgkit import envs, losses, modules
+from pgkit import advantages, envs, losses, modules, updates
 
 
 def make_batch(actor, env, rows=32):
@@ -167,7 +167,7 @@ def test_samples_mc_entropy_averages_draws(agent):
     assert deviations[0] / deviations[1] == pytest.approx(4.0, rel=0.1)
 
 
-def test_a_composite_action_is_scored_by_the_sum_of_its_parts():
+def composite_actor():
     parts = {"steer": torch.distributions.Normal, "gear": torch.distributions.Categorical}
     names = {"steer": ("action", "steer"), "gear": ("action", "gear")}
     net = nn.Linear(3, 5)
@@ -185,12 +185,15 @@ def test_a_composite_action_is_scored_by_the_sum_of_its_parts():
         distribution_class=partial(CompositeDistribution, distribution_map=parts, name_map=names),
         return_log_prob=True,
     )
-    batch = actor(TensorDict({"observation": torch.randn(8, 3)}, [8])).detach()
+    return actor, keys, actor(TensorDict({"observation": torch.randn(8, 3)}, [8])).detach()
+
+
+def test_a_composite_action_is_scored_by_the_sum_of_its_parts():
+    actor, keys, batch = composite_actor()
     batch["advantage"] = torch.randn(8, 1)
     log_probs = [("action", "steer_log_prob"), ("action", "gear_log_prob")]
     loss = losses.ClipPPOLoss(actor, normalize_advantage=False, entropy_coeff=0.1)
-    loss.set_keys(action="action", sample_log_prob=log_probs)
-    assert set(log_probs) <= set(loss.in_keys)
+    assert {*log_probs, ("action", "steer"), ("action", "gear")} <= set(loss.in_keys)
     for key in log_probs:
         batch[key] = batch[key] - 0.05
     out = loss(batch)
@@ -209,3 +212,29 @@ def test_unreduced_losses_have_the_batch_s_shape(agent):
     for key in ("loss_objective", "loss_critic", "loss_entropy"):
         assert out[key].shape == batch.shape
         torch.testing.assert_close(out[key].mean(), whole[key])
+
+
+def test_a_composite_action_in_an_update_and_in_vtrace():
+    actor, _, batch = composite_actor()
+    after = {"observation": torch.randn(8, 3), "reward": torch.ones(8, 1)}
+    batch["next"] = after | dict.fromkeys(("done", "terminated"), torch.zeros(8, 1, dtype=torch.bool))
+    critic = TensorDictModule(nn.Linear(3, 1), ["observation"], ["state_value"])
+    parameters = [*actor.parameters(), *critic.parameters()]
+    for block in (advantages.GAE(critic), advantages.VTrace(critic, actor)):
+        update = updates.OnPolicyUpdate(
+            losses.ClipPPOLoss(actor, critic), block, torch.optim.SGD(parameters, lr=0.0), epochs=1, compile="off"
+        )
+        metrics = update(batch.clone())
+        assert metrics["approx_kl"] == pytest.approx(0, abs=1e-6) and metrics["clip_fraction"] == 0
+        assert "steer" in str(update)
+
+
+def test_padded_entries_have_no_part_in_the_advantage_s_scale():
+    env = envs.make("Pendulum-v1")
+    actor = modules.gaussian_actor(env)
+    batch = make_batch(actor, env, rows=6)
+    loss = losses.ClipPPOLoss(actor, normalize_advantage=True)
+    alone = loss(batch[:4])["loss_objective"]
+    batch["advantage"][4:] = 100
+    batch["collector", "mask"] = torch.tensor([True] * 4 + [False] * 2)
+    torch.testing.assert_close(loss(batch)["loss_objective"], alone)

@@ -15,6 +15,7 @@ from torchrl.objectives import SoftUpdate
 
 from pgkit import collectors, controllers, data, envs, functional, losses, modules, updates
 from pgkit.errors import UserError
+from pgkit.losses.discrete_sac import _chosen
 from tests.modules.test_discrete import Masked
 
 FORMS = ["expectation", "gumbel_softmax"]
@@ -270,3 +271,11 @@ def test_the_target_entropy_comes_from_the_number_of_actions():
     assert losses.DiscreteSACLoss(*networks, action_spec=env.action_spec_unbatched).target_entropy == expected
     with pytest.raises(UserError, match="read off the first batch"):
         _ = losses.DiscreteSACLoss(*networks).target_entropy
+
+
+def test_indices_with_a_trailing_1_are_no_one_hot_actions():
+    q, index = torch.arange(12.0).view(2, 2, 3), torch.tensor([2, 1])
+    expected = torch.tensor([[2.0, 5.0], [7.0, 10.0]])
+    one_hot = torch.nn.functional.one_hot(index, 3)
+    for action in (index, index.unsqueeze(-1), one_hot):
+        torch.testing.assert_close(_chosen(q, action), expected)

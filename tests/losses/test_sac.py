@@ -227,3 +227,10 @@ def test_a_distance_has_one_owner(loss):
     quantiles = modules.q_value(env, number, (8,), head=heads.Quantiles(5, 1))
     with pytest.raises(UserError, match="loss_function='l1' is for critics without a head"):
         loss(actor, quantiles, loss_function="l1", **settings)
+
+
+def test_the_target_entropy_of_an_environment_s_composite_spec():
+    env = envs.make("Pendulum-v1", num_envs=3)
+    actor, critics = modules.tanh_normal_actor(env), modules.q_value(env)
+    for spec in (env.full_action_spec, env.full_action_spec_unbatched, env.action_spec):
+        assert losses.SACLoss(actor, critics, action_spec=spec).target_entropy == -1

@@ -1,3 +1,4 @@
+import gymnasium as gym
 import pytest
 import torch
 from torch import nn
@@ -86,3 +87,12 @@ def test_a_saturated_squashed_action_can_be_scored_again_if_the_mean_is_bounded(
     out = unbounded(env.reset())
     again = unbounded.get_dist(out.select("observation")).log_prob(out["action"])
     assert (again - out["action_log_prob"]).abs().min() > 10  # the trap itself
+
+
+@pytest.mark.parametrize("make", [modules.gaussian_actor, modules.tanh_normal_actor, modules.deterministic_actor])
+def test_actions_that_are_no_vector_are_refused(make):
+    class Matrix(gym.Env):
+        observation_space, action_space = gym.spaces.Box(-1, 1, (3,)), gym.spaces.Box(-1, 1, (2, 3))
+
+    with pytest.raises(UserError, match=r"actions have shape \(2, 3\)"):
+        make(envs.make(Matrix))

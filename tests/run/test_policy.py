@@ -1,12 +1,13 @@
 from pathlib import Path
 from types import SimpleNamespace
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
 from tensordict.nn import TensorDictModule
 
-from pgkit import run
+from pgkit import envs, modules, run
 from pgkit.errors import UserError
 
 
@@ -55,3 +56,13 @@ def test_a_wrong_shape_and_a_wrong_directory(run_dir: Path, tmp_path: Path):
         run.load_policy(run_dir).predict(np.zeros(3))
     with pytest.raises(UserError, match="not a run directory"):
         run.load_policy(tmp_path)
+
+
+def test_discrete_actions_begin_where_the_space_does():
+    class Late(gym.Env):
+        observation_space, action_space = gym.spaces.Box(-1, 1, (2,)), gym.spaces.Discrete(3, start=5)
+
+    env = envs.make(Late)
+    policy = run.Policy(modules.categorical_actor(env), lambda: None, **run.policy.describe_env(env))
+    actions = policy.predict(np.random.default_rng(0).normal(size=(50, 2)) * 9)
+    assert set(actions.tolist()) <= {5, 6, 7} and policy.predict(np.zeros(2)) in Late.action_space

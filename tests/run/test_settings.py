@@ -160,6 +160,7 @@ def test_whole_numbers_may_have_an_exponent():
         ({"hidden": (64, 0)}, "--hidden 0: give at least 1"),
         ({"learning_rate": -1.0}, "--learning-rate -1.0: give at least 0"),
         ({"seed": -1}, "--seed -1: give at least 0"),
+        ({"replay": -1}, "--replay -1: give at least 0"),
         ({"gamma": 1.5}, "--gamma 1.5: give at most 1"),
     ],
 )
@@ -167,6 +168,7 @@ def test_numbers_that_no_run_can_have(setting: dict, message: str):
     @dataclass
     class Discounted(Args):
         gamma: float | None = None
+        replay: int | str = "uniform"
 
     check(Discounted())
     with pytest.raises(UserError, match=message):

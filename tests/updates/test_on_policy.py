@@ -287,3 +287,24 @@ def test_torchrl_parts_unmodified():
 def test_advantage_is_normalized_by_one_owner_only():
     with pytest.raises(UserError, match="normalizes the advantage already"):
         make_agent(normalize_advantage=True)
+
+
+def test_a_last_minibatch_of_one_row_is_no_nan():
+    loss = partial(losses.ClipPPOLoss, normalize_advantage=False)
+    update = make_agent(loss_class=loss, minibatch_size=32, normalize_advantage=True, epochs=1)
+    metrics = update(make_rollout(rows=(1, 33)))
+    assert metrics["loss_objective"] == metrics["loss_objective"]
+    assert all(p.isfinite().all() for p in update.loss.parameters())
+
+
+def test_a_schedule_of_what_the_loss_does_not_have_is_refused():
+    with pytest.raises(UserError, match="'clip_epsilom'.*lr, clip_epsilon, critic_coeff, entropy_coeff"):
+        make_agent(schedules={"clip_epsilom": lambda progress: 0.1}, total_frames=100)
+
+
+@pytest.mark.parametrize(("network", "key"), [("actor", "foo"), ("critic", "v")])
+def test_a_key_that_nobody_writes_is_explained(network, key):
+    update = make_agent()
+    update.loss.set_keys(**({"action": key} if network == "actor" else {"value": key}))
+    with pytest.raises(UserError, match=f"'?{key}'?"):
+        update(make_rollout())
