@@ -51,7 +51,7 @@ class Args(run.RunArgs):
     log_std: float = -0.5
     """Initial log standard deviation of a continuous policy."""
     collector: Literal["pgkit", "torchrl"] = "pgkit"
-    """pgkit's VectorCollector, or torchrl.collectors.Collector."""
+    """pgkit's VectorCollector, or TorchRL's Collector: one process, and new episodes on a resume."""
 
 
 PRESETS = {

@@ -67,7 +67,7 @@ class Args(run.RunArgs):
     sequence_length: int = 16
     """With a memory: steps of a sequence, which gradients flow through; minibatches are made of whole ones."""
     collector: Literal["pgkit", "torchrl"] = "pgkit"
-    """pgkit's VectorCollector, or torchrl.collectors.Collector."""
+    """pgkit's VectorCollector, or TorchRL's Collector: one process, and new episodes on a resume."""
 
 
 PRESETS = {

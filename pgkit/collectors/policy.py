@@ -127,6 +127,8 @@ def example(env: VectorEnv, actor: TensorDictModuleBase) -> tuple[Tensor, ...]:
             f"the actor reads '{missing[0]}', the environment observes {', '.join(map(str, entries.keys()))}: build "
             "the actor from this environment; envs.make(..., flatten=False) keeps a Dict observation's entries apart"
         )
+    if elsewhere := [p.device for p in actor.parameters() if p.device.type != "cpu"]:
+        raise UserError(f"the actor is on {elsewhere[0]}, environments and collectors are on the CPU: actor.to('cpu')")
     misfit = "the actor was built for another environment: build it from this one (modules.gaussian_actor(env))"
     with torch.no_grad(), torch.random.fork_rng(devices=[]):
         try:

@@ -136,7 +136,8 @@ def _make_dm_control(env_id: str, **kwargs: Any) -> gym.Env:
     tasks = [(d, t) for d, t in suite.ALL_TASKS]
     if (domain, task) not in tasks:
         raise _unknown(env_id, [f"dm_control/{d}-{t}-v0" for d, t in tasks])
-    return DmControlCompatibilityV0(suite.load(domain, task, task_kwargs=kwargs or None))
+    rendering = {key: kwargs.pop(key) for key in ("render_mode", "render_kwargs") if key in kwargs}
+    return DmControlCompatibilityV0(suite.load(domain, task, task_kwargs=kwargs or None), **rendering)
 
 
 def _unknown(env_id: str, known: list[str]) -> UserError:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property
+from logging import getLogger
 from typing import Any
 
 import gymnasium as gym
@@ -57,6 +58,11 @@ class VectorEnv(EnvBase):
         else:
             spec = Unbounded((num_envs, *self.observation_shape), dtype=torch.float32)
             self.observation_spec = Composite(observation=spec, shape=(num_envs,))
+        if flatten and "action_mask" in getattr(probe.observation_space, "spaces", ()):
+            getLogger("pgkit").warning(
+                "the observation's action_mask is flattened with the rest and masks nothing: "
+                "envs.make(..., flatten=False) keeps it apart"
+            )
         self.action_spec = action_spec(probe.action_space, num_envs)
         self.action_start = getattr(probe.action_space, "start", 0)  # of Gymnasium's discrete spaces; the spec's is 0
         self.reward_spec = Unbounded((num_envs, 1), dtype=torch.float32)

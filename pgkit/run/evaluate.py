@@ -9,6 +9,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from pgkit.errors import UserError
 from pgkit.run.seeding import preserved_rng
 
 Entries = Mapping[str, torch.Tensor]
@@ -75,6 +76,11 @@ def play(policy: torch.nn.Module, env: Any, episodes: int) -> tuple[np.ndarray, 
         policy: a TensorDict actor that reads ``observation`` and writes ``action``.
         env: has ``.arrays``: ``reset()``, ``step(action)``, ``obs``, ``episode_reward``, ``step_count``.
     """
+    if "arrays" not in (*dir(type(env)), *vars(env)):  # a TransformedEnv hands on its base's, without its transforms
+        raise UserError(
+            f"evaluation plays what envs.make gives, a {type(env).__name__} is none of that: "
+            "use env.rollout(steps, actor)"
+        )
     arrays, act = env.arrays, Acting(policy, getattr(env, "split", None))
     with preserved_rng(), _evaluating(policy):
         obs = arrays.reset()

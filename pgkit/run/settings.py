@@ -43,7 +43,8 @@ class RunArgs:
     compile: Literal["auto", "on", "off"] = "auto"
     """Compile the update into one graph; auto: when the run is long enough to win the compile time back."""
     resume: Path | None = None
-    """Run directory to go on with: its settings are taken over, other flags given here override them."""
+    """Run directory to go on with. Its settings are taken over; other flags given here override them, but what the
+    checkpoint holds (learning rates, coefficients) stays."""
     threads: int = 1
     """Threads that PyTorch uses in this process; 1 is fastest for small networks."""
     explain: bool = False
@@ -65,6 +66,12 @@ _BOUNDS: dict[str, tuple[float, float]] = {
     "dropout": (0, 0.99),
     "alpha_init": (1e-8, math.inf),
 }
+
+# what a checkpoint holds, in the optimizer and in the coefficients of loss and advantage
+_IN_CHECKPOINT = (
+    "learning_rate", "q_learning_rate", "alpha_learning_rate", "critic_learning_rate", "beta1",
+    "gamma", "lmbda", "clip_epsilon", "entropy_coeff", "critic_coeff",
+)  # fmt: skip
 
 A = TypeVar("A", bound=RunArgs)
 Presets = Mapping[str, Mapping[str, Any]]
@@ -233,6 +240,11 @@ def _check_resumed(saved: RunArgs, args: RunArgs) -> None:
     for name, why in {"env_id": "that run trains on", "run_dir": "a resumed run goes on in"}.items():
         if getattr(args, name) != getattr(saved, name):
             raise UserError(f"--{name.replace('_', '-')} {getattr(args, name)}: {why} {getattr(saved, name)}")
+    for name in _IN_CHECKPOINT:
+        annealed = name == "learning_rate" and getattr(args, "anneal", False)
+        if not annealed and getattr(args, name, None) != getattr(saved, name, None):
+            flag, kept = f"--{name.replace('_', '-')} {getattr(args, name)}", getattr(saved, name)
+            raise UserError(f"{flag}: a resumed run keeps its checkpoint's, {kept}; another value needs a new run")
     if getattr(args, "anneal", False) and args.total_frames != saved.total_frames:
         frames = f"{args.total_frames:,}, no longer {saved.total_frames:,} frames"
         print(f"the learning rate anneals to zero at {frames}: it jumps where the run goes on")

@@ -57,7 +57,10 @@ ROWS: dict[str, tuple[Row, str]] = {
     "observation: Text": ((spaces.Text(5), CHOICE, actor_of, True, NONE), "becomes numbers of characters"),
     "observation: Sequence": ((spaces.Sequence(BOX), CHOICE, actor_of, True, NONE), "encode it in a wrapper"),
     "action: Box, bounded": ((BOX, BOUNDED, gaussian, True, NONE), "`gaussian_actor`, clipped by the environment"),
-    "action: Box, bounded, squashed": ((BOX, BOUNDED, tanh_normal, True, NONE), "`tanh_normal_actor(tanh_loc=True)`"),
+    "action: Box, bounded, squashed": (
+        (BOX, BOUNDED, tanh_normal, True, NONE),
+        "`tanh_normal_actor(tanh_loc=True, log_std_bounds=(-5, -1))`",
+    ),
     "action: Box, unbounded": ((BOX, UNBOUNDED, gaussian, True, NONE), "`gaussian_actor`"),
     "action: Box, unbounded, squashed": ((BOX, UNBOUNDED, tanh_normal, True, NONE), "bound the Box"),
     "action: Discrete": ((BOX, CHOICE, actor_of, True, NONE), "`categorical_actor`"),

@@ -115,3 +115,10 @@ def test_several_draws_follow_the_probabilities():
     draws = Categorical(probs=probs).sample((20_000,))
     assert draws.shape == (20_000, 2)
     torch.testing.assert_close(torch.nn.functional.one_hot(draws, 3).float().mean(0), probs, rtol=0, atol=0.01)
+
+
+def test_a_mask_that_is_flattened_is_reported(caplog):
+    envs.make(Masked, num_envs=2, flatten=False)
+    assert not caplog.text
+    envs.make(Masked, num_envs=2)
+    assert "action_mask is flattened with the rest and masks nothing" in caplog.text

@@ -2,12 +2,15 @@ import random
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import ProbabilisticTensorDictModule, TensorDictModule, TensorDictSequential
 from torch.distributions import Normal
+from torchrl.envs import RewardScaling, TransformedEnv
 
-from pgkit import run
+from pgkit import envs, modules, run
+from pgkit.errors import UserError
 
 
 class NoisyPolicy(torch.nn.Module):
@@ -54,3 +57,9 @@ def test_actions_are_deterministic(kit: SimpleNamespace):
     env = kit.Env(num_envs=2, seed=0)
     run.play(TensorDictSequential([net, sample]), env, episodes=2)
     assert all((action == 0.25).all() for action in env.arrays.actions)
+
+
+def test_an_environment_with_transforms_is_not_played_without_them():
+    env = envs.make("Pendulum-v1", num_envs=2)
+    with pytest.raises(UserError, match="a TransformedEnv is none of that: use env.rollout"):
+        run.play(modules.gaussian_actor(env), TransformedEnv(env, RewardScaling(0, 1)), episodes=2)

@@ -186,3 +186,10 @@ def test_a_stretched_annealing_is_said(tmp_path: Path, capsys: pytest.CaptureFix
     assert capsys.readouterr().out == ""
     parse(Annealed, {}, ["--resume", str(tmp_path), "--total-frames", "2000"])
     assert "anneals to zero at 2,000, no longer 1,000 frames" in capsys.readouterr().out
+
+
+def test_a_resumed_run_keeps_what_its_checkpoint_holds(tmp_path: Path):
+    run_dir = saved_run(tmp_path / "run", env_id="Walk-v0", learning_rate=0.5)
+    with pytest.raises(UserError, match="--learning-rate 0.1: a resumed run keeps its checkpoint's, 0.5"):
+        parse(Args, {}, ["--resume", str(run_dir), "--learning-rate", "0.1"])
+    assert parse(Args, {}, ["--resume", str(run_dir), "--learning-rate", "0.5", "--eval-every", "7"]).eval_every == 7
