@@ -2,28 +2,34 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from pgkit.functional.checks import same_shape
 
+Distance = Callable[[Tensor, Tensor], Tensor]
 _DISTANCES = {"l2": F.mse_loss, "l1": F.l1_loss, "smooth_l1": F.smooth_l1_loss}
 
 
-def value_loss(value: Tensor, target: Tensor, kind: str = "l2") -> Tensor:
+def value_loss(value: Tensor, target: Tensor, kind: str | Distance = "l2") -> Tensor:
     """Distance of a prediction from its target: ``l2`` (squared error, no factor 1/2), ``l1`` or ``smooth_l1``.
 
-    Same shape in and out; raises ``ValueError`` for two shapes or an unknown kind.
+    Or a function of one's own, ``kind(value, target)``, unreduced. Same shape in and out; raises ``ValueError`` for two
+    shapes or an unknown kind.
     """
     same_shape(value=value, target=target)
+    if not isinstance(kind, str):
+        return kind(value, target)
     if kind not in _DISTANCES:
         raise ValueError(f"unknown value loss '{kind}': choose one of {', '.join(_DISTANCES)}")
     return _DISTANCES[kind](value, target, reduction="none")
 
 
 def clipped_value_loss(
-    value: Tensor, target: Tensor, old_value: Tensor, clip: float | Tensor, kind: str = "l2"
+    value: Tensor, target: Tensor, old_value: Tensor, clip: float | Tensor, kind: str | Distance = "l2"
 ) -> Tensor:
     r"""The larger of the losses of :math:`V` and of :math:`V_{old} + \text{clip}(V - V_{old}, \pm\epsilon)`.
 

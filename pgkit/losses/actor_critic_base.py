@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from pgkit.functional import clipped_value_loss, explained_variance, standardize, value_loss
+from pgkit.functional.values import Distance
 from pgkit.losses.policy_base import PolicyLoss
 
 
@@ -22,7 +23,7 @@ class ActorCriticLoss(PolicyLoss):
         critic_network: value operator; None leaves the value loss out.
         entropy_coeff: weight of the entropy bonus.
         critic_coeff: weight of the value loss; None or 0 leaves it out.
-        loss_critic_type: ``l2``, ``l1`` or ``smooth_l1``.
+        loss_critic_type: ``l2``, ``l1``, ``smooth_l1``, or a function ``(value, target) -> loss``, unreduced.
         normalize_advantage: zero mean and unit deviation within the minibatch.
         clip_value: clip the value's change to this distance from ``state_value``.
         entropy_bonus: False leaves entropy out altogether.
@@ -44,7 +45,7 @@ class ActorCriticLoss(PolicyLoss):
         *,
         entropy_coeff: float = 0.0,
         critic_coeff: float | None = 1.0,
-        loss_critic_type: str = "l2",
+        loss_critic_type: str | Distance = "l2",
         normalize_advantage: bool = False,
         clip_value: float | None = None,
         entropy_bonus: bool = True,

@@ -11,6 +11,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from pgkit.functional import approx_kl, clip_surrogate, same_shape
+from pgkit.functional.values import Distance
 from pgkit.losses.actor_critic_base import ActorCriticLoss
 
 Surrogate = Callable[[Tensor, Tensor], Tensor]
@@ -58,7 +59,7 @@ class ClipPPOLoss(ActorCriticLoss):
         surrogate: Surrogate | None = None,
         entropy_coeff: float = 0.0,
         critic_coeff: float | None = 1.0,
-        loss_critic_type: str = "l2",
+        loss_critic_type: str | Distance = "l2",
         normalize_advantage: bool = True,
         clip_value: bool | float | None = None,
         entropy_bonus: bool = True,

@@ -11,6 +11,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from pgkit.functional import adapted_coefficient, approx_kl, ratio_surrogate
+from pgkit.functional.values import Distance
 from pgkit.losses.actor_critic_base import ActorCriticLoss
 
 
@@ -61,7 +62,7 @@ class KLPENPPOLoss(ActorCriticLoss):
         decrement: float = 0.5,
         entropy_coeff: float = 0.0,
         critic_coeff: float | None = 1.0,
-        loss_critic_type: str = "l2",
+        loss_critic_type: str | Distance = "l2",
         normalize_advantage: bool = True,
         clip_value: float | None = None,
         entropy_bonus: bool = True,

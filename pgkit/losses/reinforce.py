@@ -7,6 +7,7 @@ from tensordict.nn import TensorDictModule, dispatch
 from tensordict.utils import NestedKey
 
 from pgkit.functional import policy_gradient
+from pgkit.functional.values import Distance
 from pgkit.losses.actor_critic_base import ActorCriticLoss
 
 
@@ -32,7 +33,7 @@ class ReinforceLoss(ActorCriticLoss):
         actor_network: TensorDictModule,
         critic_network: TensorDictModule | None = None,
         *,
-        loss_critic_type: str = "l2",
+        loss_critic_type: str | Distance = "l2",
         clip_value: float | None = None,
         separate_losses: bool = False,
         reduction: str | None = None,

@@ -9,6 +9,7 @@ def test_squared_error_has_no_half():
     assert value_loss(value, target).item() == 4.0
     assert value_loss(value, target, "l1").item() == 2.0
     assert value_loss(value, target, "smooth_l1").item() == 1.5
+    assert value_loss(value, target, lambda v, t: (v - t) ** 4).item() == 16.0
     with pytest.raises(ValueError, match="unknown value loss 'huber'"):
         value_loss(value, target, "huber")
 
