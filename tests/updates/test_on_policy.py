@@ -194,8 +194,8 @@ def test_optimizer_steps_as_torch_would(optimizer):
 def test_adam_as_it_is_compiled_is_torch_s(make):
     params, twins = ([torch.linspace(-1, 1, n).double().requires_grad_() for n in (3, 5)] for _ in range(2))
     optimizer, twin = make(params, lr=0.1), make(twins, lr=0.1)
-    apply, _, _ = optimizers.functional(optimizer, fused=False)
-    some, _, _ = optimizers.functional(optimizer, fused=False, params=params[:1])
+    whole, part = (optimizers.functional(optimizer, fused=False, params=ps) for ps in (params, params[:1]))
+    assert whole is not None and part is not None
     for step in range(6):
         grads = [(i + 2 - step) * torch.ones_like(p).cumsum(0) for i, p in enumerate(twins)]
         both = step % 2 == 0  # counters differ between the parameters
@@ -203,7 +203,7 @@ def test_adam_as_it_is_compiled_is_torch_s(make):
             p.grad = grad if both or p is twins[0] else None
         twin.step()
         with torch.no_grad():
-            record(lambda *g, f=apply if both else some: [f(list(g)), *g][1:], grads if both else grads[:1])
+            record(lambda *g, f=(whole if both else part)[0]: [f(list(g)), *g][1:], grads if both else grads[:1])
     torch.testing.assert_close(params, twins, rtol=1e-12, atol=1e-12)
     torch.testing.assert_close(optimizer.state_dict()["state"], twin.state_dict()["state"], check_dtype=False)
 
