@@ -117,9 +117,10 @@ VARIANTS = {
     "droq": dict(critic="droq", actor_value="mean", steps=1, updates_per_step=20.0, actor_delay=20),
     "tqc": dict(value_head="quantile", num_critics=5, actor_value="mean"),
     "crossq": dict(
-        critic="crossq", actor_delay=3, beta1=0.5, learning_rate=1e-3, q_learning_rate=1e-3, alpha_learning_rate=1e-3
+        critic="crossq", random_frames=5_000, actor_delay=3, beta1=0.5,
+        learning_rate=1e-3, q_learning_rate=1e-3, alpha_learning_rate=1e-3,
     ),
-}
+}  # fmt: skip
 
 
 def networks(args: Args, env: envs.VectorEnv) -> tuple[ProbabilisticActor, modules.QValue, Any]:
