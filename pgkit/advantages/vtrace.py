@@ -11,7 +11,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from pgkit.advantages.base import Advantage, ends
-from pgkit.functional import same_shape, vtrace
+from pgkit.functional import listed, same_shape, vtrace
 
 
 class VTrace(Advantage):
@@ -58,7 +58,7 @@ class VTrace(Advantage):
             sample_log_prob = "action_log_prob" if actor is None else list(actor.log_prob_keys)
         self.log_prob_key, self.sample_log_prob = log_prob_key, sample_log_prob
         reads = [log_prob_key] if actor is None else [*actor.in_keys, *actor.dist_sample_keys]
-        self.in_keys = list(dict.fromkeys([*self.in_keys, *_listed(sample_log_prob), *reads]))
+        self.in_keys = list(dict.fromkeys([*self.in_keys, *listed(sample_log_prob), *reads]))
         self.out_keys += [] if actor is None else [log_prob_key]
 
     def estimate(self, value: Tensor, next_value: Tensor, rollout: TensorDictBase) -> tuple[Tensor, Tensor]:
@@ -69,13 +69,9 @@ class VTrace(Advantage):
                 actions = rollout if composite else rollout[self.actor.dist_sample_keys[0]]
                 rollout.set(self.log_prob_key, dist.log_prob(actions))
         log_prob = rollout[self.log_prob_key]
-        old_log_prob = torch.stack([rollout[key] for key in _listed(self.sample_log_prob)]).sum(0)
+        old_log_prob = torch.stack([rollout[key] for key in listed(self.sample_log_prob)]).sum(0)
         same_shape(log_prob=log_prob, old_log_prob=old_log_prob)
         return vtrace(
             (log_prob - old_log_prob).unsqueeze(-1), value, next_value, *ends(rollout),
             self.gamma, self.lmbda, self.rho_thresh, self.c_thresh,
         )  # fmt: skip
-
-
-def _listed(keys: Any) -> list[NestedKey]:
-    return keys if isinstance(keys, list) else [keys]

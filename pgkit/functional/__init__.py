@@ -1,7 +1,7 @@
 """Pure tensor maths: one idea a function, shapes checked, results unreduced."""
 
 from pgkit.functional.adaptation import adapted_coefficient
-from pgkit.functional.checks import is_flag, same_shape
+from pgkit.functional.checks import is_flag, listed, same_shape
 from pgkit.functional.conjugate_gradient import conjugate_gradient
 from pgkit.functional.discrete import expected_soft_value, straight_through_sample
 from pgkit.functional.distributional import (
@@ -57,6 +57,7 @@ __all__ = [
     "hl_gauss",
     "is_flag",
     "lambda_return",
+    "listed",
     "n_step_return",
     "policy_gradient",
     "quadratic_surrogate",

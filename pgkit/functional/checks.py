@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -26,3 +28,8 @@ def is_flag(**tensors: Tensor) -> None:
     for name, tensor in tensors.items():
         if tensor.dtype != torch.bool:
             raise TypeError(f"{name} must be boolean, not {tensor.dtype}")
+
+
+def listed(keys: Any) -> list[Any]:
+    """The keys of a setting that may be one key, or several in a list: the parts of a composite action."""
+    return keys if isinstance(keys, list) else [keys]

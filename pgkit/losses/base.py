@@ -10,10 +10,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.objectives import LossModule
 
-
-def listed(keys: Any) -> list[NestedKey]:
-    """The keys of a setting that may be one key, or several in a list: the parts of a composite action."""
-    return keys if isinstance(keys, list) else [keys]
+from pgkit.functional import listed
 
 
 class Loss(LossModule):

@@ -14,8 +14,8 @@ from torch.distributions import Distribution, kl_divergence
 from torchrl.modules.distributions.utils import sample_and_log_prob
 from torchrl.objectives.utils import ValueEstimators, dispatch_value_estimator
 
-from pgkit.functional import approx_kl, same_shape
-from pgkit.losses.base import Loss, listed
+from pgkit.functional import approx_kl, listed, same_shape
+from pgkit.losses.base import Loss
 
 
 class PolicyLoss(Loss):

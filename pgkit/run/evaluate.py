@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 from tensordict import TensorDict
+from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from pgkit.errors import UserError
@@ -76,7 +77,7 @@ def play(policy: torch.nn.Module, env: Any, episodes: int) -> tuple[np.ndarray, 
         policy: a TensorDict actor that reads ``observation`` and writes ``action``.
         env: has ``.arrays``: ``reset()``, ``step(action)``, ``obs``, ``episode_reward``, ``step_count``.
     """
-    if "arrays" not in (*dir(type(env)), *vars(env)):  # a TransformedEnv hands on its base's, without its transforms
+    if isinstance(env, TransformedEnv) or not hasattr(env, "arrays"):  # the former's arrays know no transforms
         raise UserError(
             f"evaluation plays what envs.make gives, a {type(env).__name__} is none of that: "
             "use env.rollout(steps, actor)"

@@ -69,8 +69,8 @@ _BOUNDS: dict[str, tuple[float, float]] = {
 
 # what a checkpoint holds, in the optimizer and in the coefficients of loss and advantage
 _IN_CHECKPOINT = (
-    "learning_rate", "q_learning_rate", "alpha_learning_rate", "critic_learning_rate", "beta1",
-    "gamma", "lmbda", "clip_epsilon", "entropy_coeff", "critic_coeff",
+    "learning_rate", "q_learning_rate", "alpha_learning_rate", "beta1", "gamma", "lmbda",
+    "clip_epsilon", "entropy_coeff", "critic_coeff",
 )  # fmt: skip
 
 A = TypeVar("A", bound=RunArgs)

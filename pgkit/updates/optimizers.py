@@ -136,9 +136,9 @@ def _adam(optimizer: Optimizer, group: dict[str, Any], lr: Tensor, fused: bool) 
         )  # fmt: skip
 
     def traced(grads: list[Tensor]) -> None:  # the same, with the bias corrections of all parameters at once
-        counts = torch.stack([step.add_(1) for step in steps])
-        rates = computed_once(lr / (1 - beta1**counts))
-        roots = computed_once((1 - beta2**counts).sqrt())
+        counts = torch.stack([step.add_(1) for step in steps]).double()  # as precise as the eager step's numbers
+        rates = computed_once((lr / (1 - beta1**counts)).to(lr.dtype))
+        roots = computed_once((1 - beta2**counts).sqrt().to(lr.dtype))
         decay, decoupled = group["weight_decay"], group.get("decoupled_weight_decay", False)
         for i, (p, grad, average, square) in enumerate(zip(group["params"], grads, averages, squares, strict=True)):
             grad = -grad if group["maximize"] else grad

@@ -227,6 +227,8 @@ def test_a_composite_action_in_an_update_and_in_vtrace():
         metrics = update(batch.clone())
         assert metrics["approx_kl"] == pytest.approx(0, abs=1e-6) and metrics["clip_fraction"] == 0
         assert "steer" in str(update)
+    scored = advantages.VTrace(critic, actor)(batch.clone())["current_log_prob"]
+    torch.testing.assert_close(scored, batch["action", "steer_log_prob"] + batch["action", "gear_log_prob"])
 
 
 def test_padded_entries_have_no_part_in_the_advantage_s_scale():
