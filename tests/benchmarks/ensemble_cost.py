@@ -8,17 +8,17 @@ them. Updates and floors alternate, round by round; the table has medians over t
 """
 
 from dataclasses import dataclass
-from itertools import pairwise
 from statistics import median
 from typing import Any
 
 import contest
+import floors
 import torch
 import tyro
 
 from pgkit import data, envs, losses, modules, updates
 
-ENV_ID, BATCH, WIDTH, OBSERVATION, ACTION, SUBSET = "HalfCheetah-v5", 256, 256, 17, 6, 2
+ENV_ID, WIDTH, OBSERVATION, ACTION, SUBSET = "HalfCheetah-v5", 256, 17, 6, 2
 
 
 @dataclass
@@ -51,70 +51,38 @@ def agent(critics: int, blocks: bool) -> updates.OffPolicyUpdate:
     buffer = data.ReplayBuffer(env, 10_000)
     buffer.extend(env.rollout(1_000, break_when_any_done=False))
     return updates.OffPolicyUpdate(
-        loss, buffer, torch.optim.Adam(loss.parameters(), lr=3e-4), batch_size=BATCH, compile="on"
+        loss, buffer, torch.optim.Adam(loss.parameters(), lr=3e-4), batch_size=floors.BATCH, compile="on"
     )
 
 
-def matmuls(critics: int) -> list[tuple[torch.Tensor, torch.Tensor, torch.Tensor]]:
-    """Every matmul of one update as (left, right, out), batched over the critics.
-
-    Target: actor and the subset of critics forward. Critic loss: all critics forward; weight gradients of every layer,
-    input gradients of all but the first. Actor loss: actor and all critics forward; input gradients through the critics
-    down to the action; the actor's weight gradients, input gradients of all but its first layer.
-    """
+def matmuls(critics: int) -> floors.Matmuls:
+    """Every matmul of one update."""
     actor, critic = [OBSERVATION, WIDTH, WIDTH, 2 * ACTION], [OBSERVATION + ACTION, WIDTH, WIDTH, 1]
-    target = forward(1, actor) + forward(min(SUBSET, critics), critic)
-    learning = forward(critics, critic) + weight_gradients(critics, critic) + input_gradients(critics, critic, first=1)
-    through = forward(critics, critic) + input_gradients(critics, critic, first=0)
-    policy = forward(1, actor) + through + weight_gradients(1, actor) + input_gradients(1, actor, first=1)
-    return target + learning + policy
-
-
-def forward(num: int, sizes: list[int]) -> list[Any]:
-    layers = pairwise(sizes)
-    return [(torch.randn(num, BATCH, i), torch.randn(num, i, o), torch.empty(num, BATCH, o)) for i, o in layers]
-
-
-def weight_gradients(num: int, sizes: list[int]) -> list[Any]:
-    layers = pairwise(sizes)
-    return [(torch.randn(num, BATCH, i).mT, torch.randn(num, BATCH, o), torch.empty(num, i, o)) for i, o in layers]
-
-
-def input_gradients(num: int, sizes: list[int], first: int) -> list[Any]:
-    layers = list(pairwise(sizes))[first:]
-    return [(torch.randn(num, BATCH, o), torch.randn(num, i, o).mT, torch.empty(num, BATCH, i)) for i, o in layers]
-
-
-def gflop(calls: list[tuple[torch.Tensor, torch.Tensor, torch.Tensor]]) -> float:
-    return sum(2 * left.numel() * right.shape[-1] for left, right, _ in calls) / 1e9
+    learning, policy = floors.actor_critic(actor, critic, min(SUBSET, critics), critics, critics)
+    return learning + policy
 
 
 def main(options: Options) -> None:
     """Prints the table."""
     torch.set_num_threads(options.threads)
     agents = {n: agent(n, options.blocks) for n in options.critics}
-    floors = {n: matmuls(n) for n in options.critics}
-
-    def alone(calls: list[Any]) -> None:
-        for left, right, out in calls:
-            torch.bmm(left, right, out=out)
-
+    alone = {n: matmuls(n) for n in options.critics}
     times: dict[tuple[str, int], list[float]] = {}
     for _ in range(options.rounds):
         for n in options.critics:
             step = contest.milliseconds(lambda n=n: agents[n].train(1), options.calls, warmup=10)
             times.setdefault(("update", n), []).append(step)
-            floor = contest.milliseconds(lambda n=n: alone(floors[n]), options.calls, warmup=10)
+            floor = contest.milliseconds(lambda n=n: floors.run(alone[n]), options.calls, warmup=10)
             times.setdefault(("floor", n), []).append(floor)
     ms = {key: median(values) for key, values in times.items()}
 
     print(f"{'critics':>8} {'update ms':>10} {'floor ms':>9} {'update/floor':>13} {'GFLOP':>7}")
     for n in options.critics:
         step, floor = ms["update", n], ms["floor", n]
-        print(f"{n:>8} {step:>10.2f} {floor:>9.2f} {step / floor:>13.2f} {gflop(floors[n]):>7.3f}")
+        print(f"{n:>8} {step:>10.2f} {floor:>9.2f} {step / floor:>13.2f} {floors.gflop(alone[n]):>7.3f}")
     few, many = options.critics
     update, floor = (ms[kind, many] / ms[kind, few] for kind in ("update", "floor"))
-    flops = gflop(floors[many]) / gflop(floors[few])
+    flops = floors.gflop(alone[many]) / floors.gflop(alone[few])
     print(f"{many} critics against {few}: update {update:.2f} times, floor {floor:.2f} times, flops {flops:.2f} times")
     print(f"update ratio over floor ratio {update / floor:.2f}, over flop ratio {update / flops:.2f}")
     result = {f"{kind}_{n}_ms": value for (kind, n), value in ms.items()}

@@ -3,7 +3,8 @@
     python tests/benchmarks/family_speed.py --algorithm a2c
 
 Same env, nets and updates for both sides; the settings stand in the code. `--algorithm trpo`, `td3` or `tqc` likewise;
-`a2c_cartpole` is A2C on CartPole-v1. A2C runs in one process, and with two workers that collect beside the update.
+`a2c_cartpole` is A2C on CartPole-v1. A2C runs in one process, and with two workers that collect
+beside the update; TD3 has the bare matmuls of its updates as a third contender.
 """
 
 from collections.abc import Iterator
@@ -12,6 +13,7 @@ from functools import partial
 from typing import Any, Literal
 
 import contest
+import floors
 import torch
 import tyro
 
@@ -123,6 +125,15 @@ def peer(seed: int, algorithm: str) -> Iterator[int]:
         yield model.num_timesteps
 
 
+def td3_floor(seed: int) -> Iterator[int]:
+    """The matmuls of TD3's updates alone, the actor's at every second one: no environment, no replay, no optimizer."""
+    critics, actor = floors.actor_critic([17, 256, 256, 6], [23, 256, 256, 1], targets=2, learning=2, climbed=1)
+    for frame in range(CHUNK, 10**9, CHUNK):
+        for _ in range(CHUNK // 2):
+            floors.run(critics + critics + actor)
+        yield frame
+
+
 CONTENDERS = {
     f"{name}-{side}": contest.Contender(partial(start, algorithm=name), needs, note)
     for name, ours in {
@@ -133,7 +144,7 @@ CONTENDERS = {
         *([("workers", partial(on_policy, workers=2), "pgkit", "compiled, 2 workers")] if "a2c" in name else []),
         ("peer", peer, "sb3_contrib", "sb3-contrib" if name in ("trpo", "tqc") else "Stable-Baselines3"),
     )
-}  # fmt: skip
+} | {"td3-floor": contest.Contender(td3_floor, "torch", "its matmuls alone")}  # fmt: skip
 
 if __name__ == "__main__":
     options = tyro.cli(Options, description=__doc__)

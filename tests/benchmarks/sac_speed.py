@@ -9,16 +9,16 @@ Adam 3e-4, tau 0.005, gamma 0.99, replay of a million, 1,000 random frames first
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
-from itertools import pairwise
 from statistics import median
 from typing import Any
 
 import contest
+import floors
 import torch
 import tyro
 from tensordict import TensorDict
 
-ENV_ID, BATCH, WIDTH, OBSERVATION, ACTION = "HalfCheetah-v5", 256, 256, 17, 6
+ENV_ID, BATCH, WIDTH, OBSERVATION, ACTION = "HalfCheetah-v5", floors.BATCH, 256, 17, 6
 RANDOM_FRAMES, CHUNK, BUFFER = 1000, 500, 1_000_000
 STEPS = 16  # frames collected before as many updates, in recipes/sac.py
 
@@ -112,46 +112,13 @@ def _baselines(algorithm: Any, seed: int, steps: int) -> Iterator[int]:
         yield model.num_timesteps
 
 
-def matmuls() -> list[tuple[torch.Tensor, torch.Tensor, torch.Tensor]]:
-    """Every matmul of one SAC update as (left, right, out), laid out as autograd lays them out.
-
-    Target: actor and two critics forward. Critic loss: two critics forward; weight gradients of every layer,
-    input gradients of all but the first. Actor loss: actor and two critics forward; input gradients through
-    both critics down to the action; the actor's weight gradients, input gradients of all but its first layer.
-    """
-    actor = [OBSERVATION, WIDTH, WIDTH, 2 * ACTION]
-    critic = [OBSERVATION + ACTION, WIDTH, WIDTH, 1]
-    target = _forward(actor) + 2 * _forward(critic)
-    critics = 2 * (_forward(critic) + _weight_gradients(critic) + _input_gradients(critic, first=1))
-    through = 2 * (_forward(critic) + _input_gradients(critic, first=0))
-    policy = _forward(actor) + through + _weight_gradients(actor) + _input_gradients(actor, first=1)
-    return target + critics + policy
-
-
-def _forward(sizes: list[int]) -> list[Any]:
-    return [(torch.randn(BATCH, i), torch.randn(o, i).T, torch.empty(BATCH, o)) for i, o in pairwise(sizes)]
-
-
-def _weight_gradients(sizes: list[int]) -> list[Any]:
-    return [(torch.randn(BATCH, o).T, torch.randn(BATCH, i), torch.empty(o, i)) for i, o in pairwise(sizes)]
-
-
-def _input_gradients(sizes: list[int], first: int) -> list[Any]:
-    layers = list(pairwise(sizes))[first:]
-    return [(torch.randn(BATCH, o), torch.randn(o, i), torch.empty(BATCH, i)) for i, o in layers]
-
-
 def floor(threads: int) -> tuple[float, float]:
     """Milliseconds that the matmuls of one SAC update take and their GFLOP, with nothing else around them."""
     torch.set_num_threads(threads)
-    calls = matmuls()
-    gflop = sum(2 * left.shape[0] * left.shape[1] * right.shape[1] for left, right, _ in calls) / 1e9
-
-    def update() -> None:
-        for left, right, out in calls:
-            torch.mm(left, right, out=out)
-
-    return contest.milliseconds(update, calls=300, warmup=50), gflop
+    actor, critic = [OBSERVATION, WIDTH, WIDTH, 2 * ACTION], [OBSERVATION + ACTION, WIDTH, WIDTH, 1]
+    learning, policy = floors.actor_critic(actor, critic, targets=2, learning=2, climbed=2)
+    matmuls = learning + policy
+    return contest.milliseconds(lambda: floors.run(matmuls), calls=300, warmup=50), floors.gflop(matmuls)
 
 
 def replay(threads: int, prioritized: bool) -> dict[str, float]:
@@ -202,18 +169,15 @@ CONTENDERS = {
 
 if __name__ == "__main__":
     options = tyro.cli(Options, description=__doc__)
-    floors = {} if options.contender else {"before": floor(threads=2)[0]}
+    alone = {} if options.contender else {"before": floor(threads=2)[0]}
     result = contest.run("SAC, HalfCheetah-v5, one update a frame", options, CONTENDERS, "pgkit")
-    floors["after"], gflop = floor(threads=2)
-    times, most = " to ".join(f"{ms:.2f}" for ms in sorted(floors.values())), 1e3 / min(floors.values())
-    print(
-        f"\nfloor, 2 threads: the {len(matmuls())} matmuls of one update ({gflop:.2f} GFLOP) take {times} ms",
-        end=" ",
-    )
+    alone["after"], gflop = floor(threads=2)
+    times, most = " to ".join(f"{ms:.2f}" for ms in sorted(alone.values())), 1e3 / min(alone.values())
+    print(f"\nfloor, 2 threads: the matmuls of one update ({gflop:.2f} GFLOP) take {times} ms", end=" ")
     print(f"(before and after the rounds): at most {most:.0f} updates/s")
     replays = {name: replay(2, name == "prioritized") for name in ("uniform", "prioritized")}
     for name, ms in replays.items():
         total = ms["write"] + ms["draw"] + ms["step"]
         share = (total - ms["step without gather"]) / total
         print(f"replay, {name}: {share:.1%} of a frame;", ", ".join(f"{part} {x:.3f}" for part, x in ms.items()))
-    contest.write(options.json, {**result, "floor_ms": floors, "gflop": gflop, "replay_ms": replays})
+    contest.write(options.json, {**result, "floor_ms": alone, "gflop": gflop, "replay_ms": replays})
