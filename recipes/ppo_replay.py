@@ -27,7 +27,7 @@ class Args(run.RunArgs):
     """Evaluate and save a checkpoint every so many frames; 0 = only at the end."""
     steps: int = 128
     """Steps each env takes for one rollout."""
-    replay: int = 3
+    old_rollouts: int = 3
     """Rollouts before the newest that are trained on with it."""
     epochs: int = 5
     """Passes over these rollouts."""
@@ -113,7 +113,7 @@ def main(args: Args) -> None:
             standardize=args.normalize_advantage == "rollout",
             return_scale=scale,
         )
-        recent = data.Recent(1 + args.replay)
+        recent = data.Recent(1 + args.old_rollouts)
         parameters = [*actor.parameters(), *critic.parameters()]
         update = updates.OnPolicyUpdate(
             loss=loss,
@@ -124,7 +124,7 @@ def main(args: Args) -> None:
             max_grad_norm=args.max_grad_norm,
             target_kl=args.target_kl,
             schedules={"lr": controllers.linear(args.learning_rate)} if args.anneal else None,
-            total_frames=args.total_frames * (1 + args.replay),  # rows that it sees
+            total_frames=args.total_frames * (1 + args.old_rollouts),  # rows that it sees
             compile=args.compile,
         )
         sizes = {"frames_per_batch": args.num_envs * args.steps, "total_frames": args.total_frames}

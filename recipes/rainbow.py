@@ -54,9 +54,9 @@ class Args(run.RunArgs):
     """Initial standard deviation of the noisy weights."""
     n_step: int = 3
     """Length of the returns that the network learns."""
-    alpha: float = 0.5
+    priority_alpha: float = 0.5
     """How much priorities count in the draws; 0 draws uniformly."""
-    beta: float = 0.4
+    priority_beta: float = 0.4
     """How far importance weights correct for that at the start; it rises to 1."""
     buffer_size: int = 100_000
     """Frames that the replay buffer keeps."""
@@ -115,7 +115,7 @@ def main(args: Args) -> None:
             support=torch.linspace(args.v_min, args.v_max, args.atoms),
             action_space="categorical",
         )
-        sampler = data.Prioritized(args.alpha, args.beta)
+        sampler = data.Prioritized(args.priority_alpha, args.priority_beta)
         buffer = data.ReplayBuffer(env, args.buffer_size, n_steps=args.n_step, sampler=sampler)
         update = updates.OffPolicyUpdate(
             loss=DistributionalDQNLoss(actor, gamma=args.gamma, delay_value=True),
@@ -140,7 +140,7 @@ def main(args: Args) -> None:
 
         replay = data.BesideCheckpoint(buffer, log.dir / "checkpoints" / "buffer.pt", save=args.save_buffer)
         log.track(policy=actor, eval_env=make_env, update=update, collector=collector, replay=replay)
-        beta = controllers.linear(args.beta, 1.0)
+        beta = controllers.linear(args.priority_beta, 1.0)
         for rollout in collector:
             net.draw_noise()
             sampler.set_beta(beta(collector.frames / args.total_frames))

@@ -14,7 +14,9 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec
 
+from pgkit.errors import UserError
 from pgkit.functional import expected_soft_value, straight_through_sample, twin_minimum, value_loss
+from pgkit.heads import Scalar
 from pgkit.losses.soft_base import SoftQLoss
 
 
@@ -86,6 +88,8 @@ class DiscreteSACLoss(SoftQLoss):
         super().__init__(
             actor_network, qvalue_network, target_entropy=target_entropy, loss_function=loss_function, **settings
         )
+        if self.head != Scalar(loss_function):
+            raise UserError(f"DiscreteSACLoss learns expected values: it has no use for head={self.head}")
         if form not in ("expectation", "gumbel_softmax"):
             raise ValueError(f"form is 'expectation' or 'gumbel_softmax', not {form!r}")
         self.form, self.relaxation, self.loss_function = form, relaxation, loss_function
@@ -100,14 +104,16 @@ class DiscreteSACLoss(SoftQLoss):
             return log_prob.exp(), log_prob
         return straight_through_sample(log_prob, self.relaxation), log_prob
 
-    def action_values(self, batch: TensorDictBase, params: Any) -> Tensor:
-        """The critics' values ``[*B, critics, actions]`` at the batch's observations."""
+    def action_values(self, batch: TensorDictBase, params: Any, members: Tensor | None = None) -> Tensor:
+        """The values ``[*B, critics, actions]`` at the batch's observations, of the critics ``members`` or of all."""
         data, key = batch.select(*self.qvalue_network.in_keys), self.tensor_keys.action_value
+        params, members = self.params_of(params, members)
         if self._each is not None:
             return self._each(data, params).get(key).movedim(0, -2)
         with params.to_module(self.qvalue_network, preserve_module_state=False):
             q = self.qvalue_network(data).get(key)
-        return q if q.dim() > data.dim() + 1 else q.unsqueeze(-2)
+        q = q if q.dim() > data.dim() + 1 else q.unsqueeze(-2)
+        return q if members is None else q[..., members, :]
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -116,9 +122,8 @@ class DiscreteSACLoss(SoftQLoss):
 
         with torch.no_grad():
             next_weights, next_log_prob = self.policy(batch["next"], self.target_actor_network_params)
-            next_q = self.action_values(batch["next"], self.target_qvalue_network_params)
-            members = self.draw()
-            next_value = twin_minimum((next_q if members is None else next_q[..., members, :]).mT)
+            next_q = self.action_values(batch["next"], self.target_qvalue_network_params, self.draw())
+            next_value = twin_minimum(next_q.mT)
             target = self.target(batch, expected_soft_value(next_weights, next_log_prob, next_value, alpha))
 
         q_all = self.action_values(batch, self.qvalue_network_params)

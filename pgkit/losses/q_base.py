@@ -125,18 +125,24 @@ class QLoss(Loss):
         ``members`` names the critics to evaluate, in the order of the result; None: all.
         """
         data = batch.select(*self.qvalue_network.in_keys, strict=False).set(self.tensor_keys.action, action)
+        params, members = self.params_of(params, members)
         if self._each is not None:
-            params = params if members is None else params[members]
             out = self._each(data, params).get(self.tensor_keys.state_action_value)
             return (out if out.dim() == data.dim() + 2 else out.squeeze(-2)).movedim(0, -2)
-        members_of = getattr(self.qvalue_network, "members", None)
-        if members is not None and members_of is not None:
-            params, members = members_of(params, members), None
         with params.to_module(self.qvalue_network, preserve_module_state=False):
             out = self.qvalue_network(data).get(self.tensor_keys.state_action_value)
         if out.dim() == data.dim() + 1:  # [*B, critics], or what a single critic with a head writes
             out = out.unsqueeze(-1 if self.head.size == 1 else -2)
         return out if members is None else out[..., members, :]
+
+    def params_of(self, params: Any, members: Tensor | slice | None) -> tuple[Any, Tensor | slice | None]:
+        """``params`` of the critics ``members``, None: of all; and what is left to take out of the results."""
+        if members is None:
+            return params, None
+        if self._each is not None:
+            return params[members], None
+        pick = getattr(self.qvalue_network, "members", None)
+        return (params, members) if pick is None else (pick(params, members), None)
 
     def q(self, batch: TensorDictBase, action: Tensor, params: Any, members: Tensor | slice | None = None) -> Tensor:
         """The critics' values ``[*B, critics]`` of ``action`` at the batch's observations."""

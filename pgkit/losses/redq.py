@@ -33,7 +33,7 @@ class REDQLoss(SoftQLoss):
         qvalue_network: likewise; with a head its pool takes the minimum's place.
         num_qvalue_nets: N, where ``qvalue_network`` is one module; an ensemble or a list brings its own.
         sub_sample_len: M.
-        settings: the other settings of :class:`~pgkit.losses.SoftQLoss`.
+        settings: the other settings of :class:`~pgkit.losses.SoftQLoss`; its ``actor_value`` is ``mean`` here.
 
     Writes what ``SACLoss`` writes.
     """
@@ -68,6 +68,6 @@ class REDQLoss(SoftQLoss):
         self.write_priority(batch, q - (atoms * weights).sum(-1, keepdim=True))
 
         action, log_prob = self.act(batch, self.actor_network_params)
-        value = self.q(batch, action, self.qvalue_network_params.detach()).mean(-1)
+        value = self.actor_value(self.q(batch, action, self.qvalue_network_params.detach()))
         same_shape(log_prob=log_prob, value=value)
         return self.result(batch, alpha * log_prob - value, qvalue_loss, action, log_prob, q)

@@ -108,7 +108,10 @@ class SoftQLoss(QLoss):
     def target_entropy(self) -> float:
         r""":math:`\bar H`; with ``auto`` and no ``action_spec``, known after the first batch."""
         if self.temperature is not None:
-            return self.temperature.target_entropy
+            target = getattr(self.temperature, "target_entropy", None)
+            if target is None:
+                raise UserError(f"{type(self.temperature).__name__} has no target_entropy")
+            return target
         if self._target_entropy is None:
             raise UserError("target_entropy='auto' is read off the first batch of actions: none was seen yet")
         return self._target_entropy

@@ -35,7 +35,7 @@ class TQCLoss(SoftQLoss):
             with ``[*B, M]``.
         num_qvalue_nets: N, where ``qvalue_network`` is one module; an ensemble or a list brings its own.
         top_quantiles_to_drop_per_net: :math:`d`, for critics without a head; a head brings its own.
-        settings: the other settings of :class:`~pgkit.losses.SoftQLoss`.
+        settings: the other settings of :class:`~pgkit.losses.SoftQLoss`; its ``actor_value`` is ``mean`` here.
 
     Writes what ``SACLoss`` writes.
     """
@@ -62,7 +62,7 @@ class TQCLoss(SoftQLoss):
 
         with torch.no_grad():
             next_action, next_log_prob = self.act(batch["next"], self.target_actor_network_params)
-            next_quantiles = self.returns(batch["next"], next_action, self.target_qvalue_network_params)
+            next_quantiles = self.returns(batch["next"], next_action, self.target_qvalue_network_params, self.draw())
             atoms, weights = self.head.pool(next_quantiles)  # [*B, N (M - d)]
             atoms = self.target(batch, soft_returns(atoms, next_log_prob, alpha))
 
@@ -72,6 +72,6 @@ class TQCLoss(SoftQLoss):
         self.write_priority(batch, q - (atoms * weights).sum(-1, keepdim=True))
 
         action, log_prob = self.act(batch, self.actor_network_params)
-        value = self.q(batch, action, self.qvalue_network_params.detach()).mean(-1)
+        value = self.actor_value(self.q(batch, action, self.qvalue_network_params.detach()))
         same_shape(log_prob=log_prob, value=value)
         return self.result(batch, alpha * log_prob - value, qvalue_loss, action, log_prob, q)

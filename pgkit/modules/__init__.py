@@ -4,13 +4,12 @@ from pgkit.modules.actors import actor, gaussian_actor, tanh_normal_actor
 from pgkit.modules.bodies import Encoder, batch_renorm_mlp, ensemble_mlp, simba
 from pgkit.modules.deterministic import deterministic_actor
 from pgkit.modules.discrete import categorical_actor
-from pgkit.modules.discrete_q_values import discrete_q_value
 from pgkit.modules.encoders import dict_encoder
 from pgkit.modules.ensemble import EnsembleBatchRenorm, EnsembleDropout, EnsembleLayerNorm, EnsembleLinear
 from pgkit.modules.exploration import GaussianExploration, OrnsteinUhlenbeck
 from pgkit.modules.mlp import mlp
 from pgkit.modules.normalizers import ObsNormalizer, ReturnScale
-from pgkit.modules.q_values import QValue, q_value
+from pgkit.modules.q_values import QValue, discrete_q_value, q_value
 from pgkit.modules.recurrent import gru, lstm
 from pgkit.modules.values import state_value
 

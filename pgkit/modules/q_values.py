@@ -8,13 +8,16 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
+from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
+from pgkit.errors import UserError
 from pgkit.heads import Head
-from pgkit.modules.bodies import Body, Norm, ensemble_mlp
+from pgkit.modules.bodies import Body, Layers, Norm, ensemble_mlp
 from pgkit.modules.ensemble import EnsembleLinear
-from pgkit.modules.sizes import action_size, observation_size
+from pgkit.modules.sizes import action_size
+from pgkit.modules.trunk import reads, trunk
 
 
 def q_value(
@@ -28,6 +31,7 @@ def q_value(
     body: Body | None = None,
     head: Head | None = None,
     normalizer: nn.Module | None = None,
+    encoder: nn.Module | None = None,
 ) -> QValue:
     """Action values: ``observation [*B, obs]``, ``action [*B, actions]`` -> ``state_action_value [*B, num_critics]``.
 
@@ -45,21 +49,72 @@ def q_value(
         body: replaces the hidden layers and the four arguments before, e.g. ``partial(modules.simba, width=256)``.
         head: what the outputs stand for, one of :mod:`pgkit.heads`; None: one number, the expected return.
         normalizer: applied to the observation first.
+        encoder: one module from the observation, or from the entries that its attribute ``in_keys`` names
+            (:func:`~pgkit.modules.dict_encoder`), to the features that all critics read beside the action.
     """
-    features = observation_size(env) + action_size(env)
-    if body is None:
-        layers, last = ensemble_mlp(num_critics, features, hidden, activation, norm, dropout)
-    else:
-        layers, last = body(num_critics, features)
+    inputs, features = trunk(env, (), activation, normalizer, encoder)
+    layers, last = _layers(num_critics, features + action_size(env), hidden, activation, norm, dropout, body)
     layers.append(EnsembleLinear(num_critics, last, 1 if head is None else head.size, gain=1.0))
-    return QValue(CriticEnsemble(layers, normalizer, scalar=head is None), num_critics, head)
+    net = CriticEnsemble(inputs, layers, reads_action=True, scalar=head is None)
+    return QValue(net, [*reads(inputs[-1]), "action"], "state_action_value", num_critics, head)
+
+
+def discrete_q_value(
+    env: EnvBase,
+    num_critics: int = 2,
+    hidden: Sequence[int] = (256, 256),
+    activation: type[nn.Module] = nn.ReLU,
+    *,
+    norm: Norm | None = None,
+    dropout: float = 0.0,
+    body: Body | None = None,
+    normalizer: nn.Module | None = None,
+    encoder: nn.Module | None = None,
+) -> QValue:
+    """Values of every action: ``observation [*B, obs] -> action_value [*B, num_critics, actions]``.
+
+    All critics are evaluated by one batched matrix product a layer. TorchRL's losses stack their critics themselves:
+    give those a list of single ones, ``[*B, actions]`` each.
+
+    Args:
+        env: an environment with one discrete action; sizes come from its specs.
+        num_critics, hidden, activation, norm, dropout, body, normalizer, encoder: as in :func:`q_value`.
+    """
+    spec = env.action_spec_unbatched
+    actions = getattr(spec.space, "n", None)
+    if spec.dtype.is_floating_point or actions is None:
+        raise UserError(
+            f"discrete_q_value needs one discrete action, the environment's is {type(spec).__name__}: "
+            "use modules.q_value for a continuous one"
+        )
+    inputs, features = trunk(env, (), activation, normalizer, encoder)
+    layers, last = _layers(num_critics, features, hidden, activation, norm, dropout, body)
+    layers.append(EnsembleLinear(num_critics, last, int(actions), gain=1.0))
+    net = CriticEnsemble(inputs, layers, reads_action=False, scalar=False)
+    return QValue(net, reads(inputs[-1]), "action_value", num_critics, None)
+
+
+def _layers(
+    num: int,
+    features: int,
+    hidden: Sequence[int],
+    activation: type[nn.Module],
+    norm: Norm | None,
+    dropout: float,
+    body: Body | None,
+) -> Layers:
+    if body is not None:
+        return body(num, features)
+    return ensemble_mlp(num, features, hidden, activation, norm, dropout)
 
 
 class QValue(TensorDictModule):
     """``num_critics`` action values with their ``head``; a loss can evaluate some of the critics alone."""
 
-    def __init__(self, net: CriticEnsemble, num_critics: int, head: Head | None) -> None:
-        super().__init__(net, in_keys=["observation", "action"], out_keys=["state_action_value"])
+    def __init__(
+        self, net: CriticEnsemble, in_keys: Sequence[NestedKey], out_key: str, num_critics: int, head: Head | None
+    ) -> None:
+        super().__init__(net, in_keys=[*in_keys], out_keys=[out_key])
         self.num_critics, self.head = num_critics, head
 
     def members(self, params: Any, index: Tensor | slice) -> Any:
@@ -70,17 +125,28 @@ class QValue(TensorDictModule):
 
 
 class CriticEnsemble(nn.Module):
-    """Critics side by side: ``[*B, obs], [*B, actions] -> [*B, critics]``, or ``[*B, critics, size]``."""
+    """Critics side by side on one observation: ``[*B, critics, size]``, for scalar critics ``[*B, critics]``.
 
-    def __init__(self, layers: Sequence[nn.Module], normalizer: nn.Module | None, scalar: bool) -> None:
+    Args:
+        inputs: what turns the observation's entries into features ``[*B, features]``, once for all critics.
+        layers: theirs, ``[critics, B, features]`` to ``[critics, B, size]``.
+        reads_action: the last input is the action ``[*B, actions]``, and stands beside the features.
+        scalar: leave ``size`` out, which is 1.
+    """
+
+    def __init__(
+        self, inputs: Sequence[nn.Module], layers: Sequence[nn.Module], reads_action: bool, scalar: bool
+    ) -> None:
         super().__init__()
-        self.normalizer, self.scalar = normalizer, scalar
+        self.encoder = inputs[0] if len(inputs) == 1 else nn.Sequential(*inputs)
         self.layers = nn.Sequential(*layers)
+        self.reads_action, self.scalar = reads_action, scalar
 
-    def forward(self, observation: Tensor, action: Tensor) -> Tensor:
-        if self.normalizer is not None:
-            observation = self.normalizer(observation)
-        x = torch.cat([observation, action], -1)
+    def forward(self, *entries: Tensor) -> Tensor:
+        if self.reads_action:
+            x = torch.cat([self.encoder(*entries[:-1]), entries[-1]], -1)
+        else:
+            x = self.encoder(*entries)
         last: Any = self.layers[-1]
         critics = last.weight.shape[0]  # fewer than there are, where only some members are evaluated
         out = self.layers(x.reshape(-1, x.shape[-1]).expand(critics, -1, -1)).transpose(0, 1)

@@ -58,7 +58,8 @@ _BOUNDS: dict[str, tuple[float, float]] = {
     **dict.fromkeys(("actor_delay", "action_repeat", "log_every", "num_critics", "atoms", "bins"), (1, math.inf)),
     **dict.fromkeys(("hidden", "critic_hidden", "sequence_length", "memory_size"), (1, math.inf)),
     **dict.fromkeys(("cg_steps", "critic_epochs"), (1, math.inf)),
-    **dict.fromkeys(("replay", "delay", "backtracks", "damping", "max_kl", "kl_target", "beta"), (0, math.inf)),
+    **dict.fromkeys(("old_rollouts", "delay", "backtracks", "damping", "max_kl", "kl_target"), (0, math.inf)),
+    **dict.fromkeys(("beta", "priority_alpha", "priority_beta"), (0, math.inf)),
     **dict.fromkeys(("seed", "eval_every", "random_frames", "updates_per_step", "max_grad_norm"), (0, math.inf)),
     **dict.fromkeys(("learning_rate", "q_learning_rate", "alpha_learning_rate", "clip_epsilon"), (0, math.inf)),
     **dict.fromkeys(("gamma", "lmbda", "tau"), (0, 1)),
@@ -67,10 +68,11 @@ _BOUNDS: dict[str, tuple[float, float]] = {
     "alpha_init": (1e-8, math.inf),
 }
 
-# what a checkpoint holds, in the optimizer and in the coefficients of loss and advantage
+# what a checkpoint holds, in the optimizer, the networks, and the coefficients of loss, advantage and exploration
 _IN_CHECKPOINT = (
-    "learning_rate", "q_learning_rate", "alpha_learning_rate", "beta1", "gamma", "lmbda",
-    "clip_epsilon", "entropy_coeff", "critic_coeff",
+    "learning_rate", "q_learning_rate", "alpha_learning_rate", "beta1", "gamma", "lmbda", "clip_epsilon",
+    "entropy_coeff", "critic_coeff", "log_std", "alpha", "alpha_init", "beta", "policy_noise", "noise_clip",
+    "epsilon_end", "v_min", "v_max", "noise",
 )  # fmt: skip
 
 A = TypeVar("A", bound=RunArgs)

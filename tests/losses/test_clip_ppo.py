@@ -129,17 +129,6 @@ def test_torchrl_plumbing(agent):
     assert loss.entropy_coeff.item() == 0.5 and isinstance(loss.entropy_coeff, torch.Tensor)
 
 
-def test_an_estimator_made_by_the_user_fills_in_the_advantage(agent):
-    env, actor, critic = agent
-    loss = losses.ClipPPOLoss(actor, critic).make_value_estimator(ValueEstimators.GAE, gamma=0.9, lmbda=0.8)
-    batch = make_batch(actor, env, rows=8).select("observation", "action", "action_log_prob").unsqueeze(0)
-    batch["next", "observation"] = batch["observation"] + 0.1
-    batch["next", "reward"] = torch.ones(1, 8, 1)
-    for key in ("done", "terminated"):
-        batch["next", key] = torch.zeros(1, 8, 1, dtype=torch.bool)
-    assert loss(batch)["loss_objective"].isfinite()
-
-
 def test_clip_epsilon_is_a_buffer_under_torchrl_s_names(agent):
     env, actor, critic = agent
     batch = make_batch(actor, env)

@@ -1,9 +1,12 @@
+import gymnasium as gym
 import pytest
 import torch
+from tensordict import TensorDict
 from torch import nn
 from torchrl.envs import GymEnv
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from pgkit import collectors, envs, modules
+from pgkit import collectors, controllers, data, envs, losses, modules, updates
 from pgkit.errors import UserError
 from tests.envs.test_layout import Sensors
 
@@ -53,3 +56,62 @@ def test_a_deterministic_actor_reads_the_entries_of_its_encoder():
     actor = modules.deterministic_actor(env, encoder=encoder())
     assert actor.in_keys == ["picture", "speed"]
     assert actor(env.reset())["action"].shape == env.action_spec.shape
+
+
+class Reach(Sensors):
+    """The best action is 0.5."""
+
+    def step(self, action):
+        obs, _, *rest = super().step(action)
+        return obs, -float((action[0] - 0.5) ** 2), *rest
+
+
+class Choose(Sensors):
+    """The best action is 1."""
+
+    action_space = gym.spaces.Discrete(3)
+
+    def step(self, action):
+        obs, _, *rest = super().step(action)
+        return obs, float(action == 1), *rest
+
+
+@pytest.mark.parametrize("discrete", [False, True])
+def test_critics_read_the_entries_of_their_encoder(discrete):
+    env = envs.make(Choose if discrete else Reach, num_envs=3, seed=1, flatten=False)
+    both = encoder()
+    build = modules.discrete_q_value if discrete else modules.q_value
+    critics = build(env, 3, (8,), encoder=both)
+    assert critics.in_keys == ["picture", "speed", *([] if discrete else ["action"])]
+    batch = env.rollout(4).reshape(-1)
+    features = both(batch["picture"], batch["speed"])
+    x = features if discrete else torch.cat([features, batch["action"]], -1)
+    first, _, last = critics.module.layers
+    for k in range(3):
+        value = (x @ first.weight[k] + first.bias[k]).relu() @ last.weight[k] + last.bias[k]
+        torch.testing.assert_close(critics(batch)[critics.out_keys[0]][:, k], value if discrete else value.squeeze(-1))
+    some = torch.tensor([2, 0])
+    params = critics.members(TensorDict.from_module(critics), some)
+    with params.to_module(critics):
+        picked = critics(batch.clone())[critics.out_keys[0]]
+    torch.testing.assert_close(picked, critics(batch)[critics.out_keys[0]][:, some])
+
+
+@pytest.mark.parametrize("discrete", [False, True])
+def test_soft_actor_critic_on_entries(discrete):
+    torch.manual_seed(0)
+    env = envs.make(Choose if discrete else Reach, num_envs=2, seed=1, flatten=False)
+    make_actor = modules.categorical_actor if discrete else modules.tanh_normal_actor
+    actor = make_actor(env, encoder=encoder())
+    critics = (modules.discrete_q_value if discrete else modules.q_value)(env, 3, (16,), encoder=encoder())
+    make_loss = losses.DiscreteSACLoss if discrete else losses.SACLoss
+    loss = make_loss(actor, critics, subset=2, gamma=0.5, temperature=controllers.FixedTemperature(0.01))
+    update = updates.OffPolicyUpdate(
+        loss, data.ReplayBuffer(env, 1000), torch.optim.Adam(loss.parameters(), 1e-2),
+        batch_size=32, learning_starts=64, compile="off",
+    )  # fmt: skip
+    for rollout in collectors.VectorCollector(env, actor, frames_per_batch=16, total_frames=480, compile="off"):
+        update(rollout)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        action = actor(env.reset())["action"].float()
+    torch.testing.assert_close(action, torch.full_like(action, 1.0 if discrete else 0.5), atol=0.2, rtol=0)

@@ -15,14 +15,13 @@ def train(recipe, run_dir, *argv, frames=400):
 
 @pytest.mark.parametrize("recipe", ["dqn", "rainbow"])
 def test_resumed_with_its_buffer_it_equals_the_straight_run(recipe, tmp_path):
-    train(recipe, tmp_path / "straight", "--save-buffer")
-    train(recipe, tmp_path / "resumed", "--save-buffer", frames=200)
+    # by itself rainbow's exponent rises over the whole run, and the first half is shorter
+    flags = ["--save-buffer", *(["--priority-beta", 1.0] if recipe == "rainbow" else [])]
+    train(recipe, tmp_path / "straight", *flags)
+    train(recipe, tmp_path / "resumed", *flags, frames=200)
     pgkit("run", recipe, "--resume", tmp_path / "resumed", "--total-frames", 400)
     straight, resumed = rows(tmp_path / "straight"), rows(tmp_path / "resumed")
-    if recipe == "dqn":
-        assert straight == resumed and straight[-1]["train/loss"]
-    else:  # beta rises over the whole run, and the first half was shorter
-        assert [row["frames"] for row in straight] == [row["frames"] for row in resumed]
+    assert straight == resumed and straight[-1]["train/loss"]
 
 
 def test_epsilon_falls_and_is_in_the_checkpoint(tmp_path):

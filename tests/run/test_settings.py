@@ -1,3 +1,5 @@
+import dataclasses
+import importlib
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -160,7 +162,7 @@ def test_whole_numbers_may_have_an_exponent():
         ({"hidden": (64, 0)}, "--hidden 0: give at least 1"),
         ({"learning_rate": -1.0}, "--learning-rate -1.0: give at least 0"),
         ({"seed": -1}, "--seed -1: give at least 0"),
-        ({"replay": -1}, "--replay -1: give at least 0"),
+        ({"old_rollouts": -1}, "--old-rollouts -1: give at least 0"),
         ({"gamma": 1.5}, "--gamma 1.5: give at most 1"),
     ],
 )
@@ -168,7 +170,7 @@ def test_numbers_that_no_run_can_have(setting: dict, message: str):
     @dataclass
     class Discounted(Args):
         gamma: float | None = None
-        replay: int | str = "uniform"
+        old_rollouts: int = 3
 
     check(Discounted())
     with pytest.raises(UserError, match=message):
@@ -186,6 +188,22 @@ def test_a_stretched_annealing_is_said(tmp_path: Path, capsys: pytest.CaptureFix
     assert capsys.readouterr().out == ""
     parse(Annealed, {}, ["--resume", str(tmp_path), "--total-frames", "2000"])
     assert "anneals to zero at 2,000, no longer 1,000 frames" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("recipe", "flag"),
+    [
+        ("ppo", "--clip-epsilon"), ("ppo", "--log-std"), ("ppo_penalty", "--beta"), ("sac", "--alpha"),
+        ("sac", "--alpha-init"), ("sac", "--beta1"), ("td3", "--policy-noise"), ("td3", "--noise-clip"),
+        ("dqn", "--epsilon-end"), ("rainbow", "--v-min"), ("rainbow", "--v-max"), ("rainbow", "--noise"),
+    ],
+)  # fmt: skip
+def test_a_flag_that_a_checkpoint_holds_is_refused_on_resume(tmp_path: Path, recipe: str, flag: str):
+    args_class = importlib.import_module(f"recipes.{recipe}").Args
+    settings = {key: value for key, value in dataclasses.asdict(args_class()).items() if key != "run_dir"}
+    run_dir = saved_run(tmp_path / "run", **settings)
+    with pytest.raises(UserError, match=f"{flag} 0.77: a resumed run keeps its checkpoint's"):
+        parse(args_class, {}, ["--resume", str(run_dir), flag, "0.77"])
 
 
 def test_a_resumed_run_keeps_what_its_checkpoint_holds(tmp_path: Path):
