@@ -63,7 +63,7 @@ class ReplayBuffer:
         self.capacity, self.n_steps, self.sampler = capacity, n_steps, sampler
         self.rows = (-(-capacity // self.columns) + 1) * self.columns  # one more step: the newest next observations
         self.final_rows = final_rows or max(capacity // 8, self.columns)
-        self.env_name = str(getattr(env, "env_id", type(env).__name__))
+        self.env_name = str(vars(env).get("env_id", type(env).__name__))
         spec, action = env.observation_spec_unbatched, env.action_spec_unbatched
         self.observation_keys = [key for key in spec.keys(True, True) if isinstance(spec[key].zero(), Tensor)]
         flag = torch.zeros(1, dtype=torch.bool)
@@ -84,6 +84,7 @@ class ReplayBuffer:
         self.data = TensorDict(tables)
         self.written = self.start = self.finals = 0  # frames ever, the oldest one kept, final observations ever
         self.owner = torch.full((self.final_rows,), -1, dtype=torch.int64)  # frame each final observation belongs to
+        self._warned = False
         self.generator = torch.Generator().manual_seed(int(torch.randint(2**62, ())) if seed is None else seed)
 
     def __len__(self) -> int:
@@ -139,7 +140,7 @@ class ReplayBuffer:
         if steps > 1:
             ends = ends.clone()
             for key, x in obs.items():
-                ends[:-columns] |= (next_obs[key][:-columns] != x[columns:]).flatten(1).any(-1)
+                ends[:-columns] |= _differ(next_obs[key][:-columns], x[columns:])
         if ends.any():
             where = ends.nonzero().squeeze(-1)
             self._keep_finals(first + where, {key: x[where] for key, x in next_obs.items()})
@@ -205,7 +206,7 @@ class ReplayBuffer:
             return
         ends = torch.zeros(self.columns, dtype=torch.bool)
         for key, x in obs.items():
-            ends |= (stored[key] != x).flatten(1).any(-1)
+            ends |= _differ(stored[key], x)
         ends &= self.frames["next_row"][last : last + self.columns] < self.rows
         if ends.any():
             where = ends.nonzero().squeeze(-1)
@@ -214,12 +215,25 @@ class ReplayBuffer:
     def _keep_finals(self, frames: Tensor, obs: dict[Any, Tensor]) -> None:
         for part in torch.arange(len(frames)).split(self.final_rows):
             slots = (self.finals + torch.arange(len(part))) % self.final_rows
-            self.start = max(self.start, int(self.owner[slots].max()) + 1)
+            oldest = int(self.owner[slots].max()) + 1
+            if oldest > self.start and not self._warned:
+                self._warned = True
+                getLogger("pgkit").warning(
+                    "episodes end more often than the replay has room for final observations (%d): it keeps %d frames "
+                    "of its %d; ReplayBuffer(final_rows=...) is that room",
+                    self.final_rows, self.written - oldest, self.capacity,
+                )  # fmt: skip
+            self.start = max(self.start, oldest)
             self.owner[slots] = frames[part]
             self.finals += len(part)
             self.frames["next_row"][frames[part] % self.rows] = (self.rows + slots).to(self.frames["next_row"].dtype)
             for key, x in obs.items():
                 self.observations[key][self.rows + slots] = x[part]
+
+
+def _differ(x: Tensor, y: Tensor) -> Tensor:
+    """Which rows ``[rows, *shape]`` differ, ``[rows]``."""
+    return (x != y).reshape(len(x), -1).any(-1)
 
 
 def _write(table: Tensor, rows: int, frame: int, x: Tensor) -> None:

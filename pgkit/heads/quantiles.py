@@ -31,6 +31,8 @@ class Quantiles:
     def __post_init__(self) -> None:
         if not 0 <= self.drop < self.size:
             raise UserError(f"drop={self.drop} of {self.size} quantiles: it must leave at least one")
+        if self.kappa <= 0:
+            raise UserError(f"kappa={self.kappa}: give a width above 0")
 
     def mean(self, out: Tensor) -> Tensor:
         """``[*B, critics, size] -> [*B, critics]``."""

@@ -109,7 +109,8 @@ class DiscreteSACLoss(SoftQLoss):
         data, key = batch.select(*self.qvalue_network.in_keys), self.tensor_keys.action_value
         params, members = self.params_of(params, members)
         if self._each is not None:
-            return self._each(data, params).get(key).movedim(0, -2)
+            out = self._each(data, params).get(key)
+            return (out if out.dim() == data.dim() + 2 else out.squeeze(-2)).movedim(0, -2)
         with params.to_module(self.qvalue_network, preserve_module_state=False):
             q = self.qvalue_network(data).get(key)
         q = q if q.dim() > data.dim() + 1 else q.unsqueeze(-2)

@@ -11,6 +11,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor
+from torchrl.modules import Delta, TanhDelta
 from torchrl.modules.distributions.utils import rsample_and_log_prob
 from torchrl.objectives.utils import ValueEstimators, _vmap_func
 
@@ -94,9 +95,14 @@ class QLoss(Loss):
             create_target_params=delay_qvalue,
             compare_against=list(actor_network.parameters()) if separate_losses else None,
         )
-        self._each = None if alone else _vmap_func(self.qvalue_network, (None, 0), randomness=self.vmap_randomness)
+        self._alone = alone
+        self._make_vmap()
         if hasattr(actor_network, "dist_sample_keys"):
             self.set_keys(action=actor_network.dist_sample_keys[0], log_prob=actor_network.log_prob_keys[0])
+
+    def _make_vmap(self) -> None:  # TorchRL's hook: again after set_vmap_randomness
+        of_each = None if self._alone else _vmap_func(self.qvalue_network, (None, 0), randomness=self.vmap_randomness)
+        self._each = of_each
 
     def set_distance(self, loss_function: str) -> None:
         """The distance of scalar critics that have no head of their own: ``l2``, ``l1`` or ``smooth_l1``."""
@@ -132,6 +138,11 @@ class QLoss(Loss):
         with params.to_module(self.qvalue_network, preserve_module_state=False):
             out = self.qvalue_network(data).get(self.tensor_keys.state_action_value)
         if out.dim() == data.dim() + 1:  # [*B, critics], or what a single critic with a head writes
+            if self.num_critics > 1 and self.head.size > 1:
+                raise UserError(
+                    f"{self.head} needs {self.head.size} outputs of each of the {self.num_critics} critics, there are "
+                    f"{tuple(out.shape)}: give the critics the head (modules.q_value(env, head=...))"
+                )
             out = out.unsqueeze(-1 if self.head.size == 1 else -2)
         return out if members is None else out[..., members, :]
 
@@ -142,7 +153,8 @@ class QLoss(Loss):
         if self._each is not None:
             return params[members], None
         pick = getattr(self.qvalue_network, "members", None)
-        return (params, members) if pick is None else (pick(params, members), None)
+        picked = None if pick is None else pick(params, members)
+        return (params, members) if picked is None else (picked, None)
 
     def q(self, batch: TensorDictBase, action: Tensor, params: Any, members: Tensor | slice | None = None) -> Tensor:
         """The critics' values ``[*B, critics]`` of ``action`` at the batch's observations."""
@@ -159,7 +171,8 @@ class QLoss(Loss):
 
     def weight(self, batch: TensorDictBase) -> Tensor | float:
         """The importance weights ``[*B]`` of a prioritized replay, 1 for any other."""
-        return batch.get(self.tensor_keys.priority_weight, 1.0)
+        weight = batch.get(self.tensor_keys.priority_weight, None)
+        return 1.0 if weight is None else weight.reshape(batch.batch_size)
 
     def write_priority(self, batch: TensorDictBase, td_error: Tensor) -> None:
         """Writes the largest error of the critics, ``[*B, critics]`` in absolute value, into the batch."""
@@ -184,7 +197,8 @@ class QLoss(Loss):
 
 def refuse_stochastic(loss: str, actor: TensorDictModule) -> None:
     """Raises ``UserError`` for an actor that draws its actions from a distribution."""
-    if hasattr(actor, "dist_sample_keys"):
+    kinds = [getattr(module, "distribution_class", None) for module in actor.modules()]
+    if any(kind is not None and not issubclass(kind, Delta | TanhDelta) for kind in kinds):
         raise UserError(
             f"{loss} needs an actor that gives one action, this one draws it from a distribution: use "
             "modules.deterministic_actor, or losses.SACLoss for this actor"

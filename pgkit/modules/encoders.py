@@ -30,4 +30,5 @@ class DictEncoder(nn.Module):
         self.encoders = nn.ModuleList(encoders.values())
 
     def forward(self, *entries: Tensor) -> Tensor:
-        return torch.cat([encoder(x) for encoder, x in zip(self.encoders, entries, strict=True)], -1)
+        numbers = [x.float() if x.dtype is torch.bool else x for x in entries]
+        return torch.cat([encoder(x) for encoder, x in zip(self.encoders, numbers, strict=True)], -1)

@@ -39,17 +39,13 @@ class EnsembleLayerNorm(nn.Module):
         return torch.addcmul(self.bias, F.layer_norm(x, x.shape[-1:]), self.weight)
 
 
-class EnsembleDropout(nn.Module):
+class EnsembleDropout(nn.Dropout):
     """Dropout (Srivastava et al., 2014): zeros with probability ``p``, the rest divided by ``1 - p``.
 
     Each member, row and unit of ``[num, B, features]`` has a zero of its own. Random numbers are drawn for each row
     and each unit only, and mixed by a hash (MurmurHash3's): ``nn.Dropout`` draws for each element, which doubles the
     cost of an update.
     """
-
-    def __init__(self, p: float) -> None:
-        super().__init__()
-        self.p = p
 
     def forward(self, x: Tensor) -> Tensor:
         if not self.training:
@@ -112,7 +108,7 @@ class EnsembleBatchRenorm(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         running = (self.var + self.eps).sqrt()
-        if not (self.training and torch.is_grad_enabled() and self.weight.requires_grad):
+        if not (self.training and torch.is_grad_enabled() and _is_trained(self.weight)):
             return (x - self.mean) / running * self.weight + self.bias
         var, mean = torch.var_mean(x, 1, correction=0, keepdim=True)
         std = (var + self.eps).sqrt()
@@ -124,3 +120,10 @@ class EnsembleBatchRenorm(nn.Module):
             self.var.lerp_(var, self.momentum)
             self.steps.add_(1)
         return ((x - mean) / std * r + d) * self.weight + self.bias
+
+
+def _is_trained(weight: Tensor) -> bool:
+    """Whether gradients reach ``weight``, through ``vmap`` too, where it hides it (a list of critics)."""
+    while torch._C._functorch.is_batchedtensor(weight):
+        weight = torch._C._functorch.get_unwrapped(weight)
+    return weight.requires_grad

@@ -27,7 +27,7 @@ class RunningMoments(nn.Module):
     @torch.no_grad()
     def update(self, x: Tensor) -> None:
         """Takes in a batch ``[*B, *shape]``."""
-        x = x.reshape(-1, *self.mean.shape)
+        x = x.reshape(-1, *self.mean.shape).to(self.mean.dtype)
         total = self.count + len(x)
         weight = (len(x) / total).to(x.dtype)  # of the new samples
         delta = x.mean(0) - self.mean

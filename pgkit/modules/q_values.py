@@ -116,9 +116,16 @@ class QValue(TensorDictModule):
     ) -> None:
         super().__init__(net, in_keys=[*in_keys], out_keys=[out_key])
         self.num_critics, self.head = num_critics, head
+        tensors = net.layers.state_dict().values()
+        self._apart = all(x.dim() > 1 and x.shape[0] == num_critics for x in tensors)
 
     def members(self, params: Any, index: Tensor | slice) -> Any:
-        """Parameters and buffers of the critics ``index`` (``[K]`` or a slice) out of ``params``, to call with."""
+        """Parameters and buffers of the critics ``index`` (``[K]`` or a slice) out of ``params``, to call with.
+
+        None where a layer has tensors without a dimension of the critics in front, which all of them share.
+        """
+        if not self._apart:
+            return None
         inner = params["module"]
         shared = {name: value for name, value in inner.items() if name != "layers"}
         return TensorDict({"module": {**shared, "layers": inner["layers"].apply(lambda x: x[index])}})

@@ -100,6 +100,11 @@ class TorchRLBatches:
         self._index = torch.arange(batch_size)
 
     def extend(self, rollout: TensorDictBase) -> None:
+        if rollout.batch_dims > 1 and rollout.batch_size[0] > 1 and "MultiStepTransform" in str(self.settings()):
+            raise UserError(
+                f"TorchRL's MultiStepTransform would add up rewards of {rollout.batch_size[0]} environments: collect "
+                "with one, or use pgkit.data.ReplayBuffer(env, n_steps=...)"
+            )
         self.buffer.extend(rollout.reshape(-1))
 
     def draw(self, batches: int) -> Iterator[Draw]:

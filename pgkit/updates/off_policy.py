@@ -17,7 +17,7 @@ from pgkit.updates.batches import Batches, OwnBatches, TorchRLBatches
 from pgkit.updates.chain import Chain
 from pgkit.updates.diagram import diagram
 from pgkit.updates.step import GradientStep
-from pgkit.updates.targets import averaging
+from pgkit.updates.targets import averaging, copying
 
 
 class OffPolicyUpdate:
@@ -88,7 +88,7 @@ class OffPolicyUpdate:
         self.frames = self.updates = 0
         self._due = 0.0
         self._batch: TensorDictBase | None = None
-        self._average = averaging(loss, tau)
+        self._average, self._copy_statistics = averaging(loss, tau), copying(loss)
         self._batches: Batches = (
             OwnBatches(buffer, loss, batch_size) if own else TorchRLBatches(buffer, loss, batch_size)
         )
@@ -98,7 +98,8 @@ class OffPolicyUpdate:
         """Stores a rollout ``[num_envs, T]`` and trains; metrics are means over the steps, none if none was due."""
         self._batches.extend(rollout)
         self.frames += rollout.numel()
-        if len(self.buffer) < self.learning_starts:
+        stored = self.buffer.written if isinstance(self.buffer, ReplayBuffer) else len(self.buffer)
+        if stored < self.learning_starts or len(self.buffer) < self.batch_size:
             return {}
         self._due += rollout.numel() * self.updates_per_step
         count = int(self._due)
@@ -108,6 +109,7 @@ class OffPolicyUpdate:
     def train(self, updates: int) -> dict[str, float]:
         """So many gradient steps on what is stored."""
         results: dict[bool, list[Tensor]] = {True: [], False: []}
+        self._copy_statistics()  # a normalizer may have moved since
         for data, index in self._batches.draw(updates):
             whole = self.updates % self.actor_delay == 0
             if not self._steps:

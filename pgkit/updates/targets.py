@@ -7,8 +7,10 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
+Pairs = list[tuple[Tensor, Tensor]]
 
-def target_pairs(loss: nn.Module) -> list[tuple[Tensor, Tensor]]:
+
+def target_pairs(loss: nn.Module) -> Pairs:
     """``(target, source)`` for every tensor of the loss's ``target_*_params`` that has a storage of its own.
 
     The loss is told that its targets are taken care of, as TorchRL's ``SoftUpdate`` does.
@@ -32,16 +34,32 @@ def averaging(loss: nn.Module, tau: float) -> Callable[[], None] | None:
 
     None for a loss without delayed parameters.
     """
-    pairs = target_pairs(loss)
-    # separate_losses holds shared parameters detached: the memory tells what is trained
-    trained = {x.data_ptr() for x in loss.parameters() if x.requires_grad}
-    moves = [source.data_ptr() in trained for _, source in pairs]
+    moving, statistics = _trained_and_not(loss)
 
     def average() -> None:
-        for (target, source), moving in zip(pairs, moves, strict=True):
-            if moving:
-                target.lerp_(source.detach(), tau)
-            else:
-                target.copy_(source)
+        for target, source in moving:
+            target.lerp_(source.detach(), tau)
+        for target, source in statistics:
+            target.copy_(source)
 
-    return torch.no_grad()(average) if pairs else None
+    return torch.no_grad()(average) if moving or statistics else None
+
+
+def copying(loss: nn.Module) -> Callable[[], None]:
+    """Copies the buffers of the trained networks (a normalizer's statistics) to the targets."""
+    _, statistics = _trained_and_not(loss)
+
+    def copy() -> None:
+        for target, source in statistics:
+            target.copy_(source)
+
+    return torch.no_grad()(copy)
+
+
+def _trained_and_not(loss: nn.Module) -> tuple[Pairs, Pairs]:
+    # separate_losses holds shared parameters detached: the memory tells what is trained
+    trained = {x.data_ptr() for x in loss.parameters() if x.requires_grad}
+    moving, statistics = [], []
+    for target, source in target_pairs(loss):
+        (moving if source.data_ptr() in trained else statistics).append((target, source))
+    return moving, statistics

@@ -1,8 +1,11 @@
 """The replay buffer against the rollouts it was filled from, frame by frame."""
 
+from functools import partial
+
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.envs import GymEnv, SerialEnv
 
 from pgkit import collectors, data, envs, modules
 from pgkit.errors import UserError
@@ -211,3 +214,27 @@ def test_files_of_two_buffers_in_one_folder_are_apart(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(UserError, match="cannot be kept in .*file: "):
         data.in_files(tmp_path / "file")
+
+
+def test_observations_without_dimensions_and_torchrls_environments():
+    env = GymEnv("FrozenLake-v1", categorical_action_encoding=True)
+    buffer = data.ReplayBuffer(env, 100)
+    rollout = env.rollout(40, break_when_any_done=False)
+    buffer.extend(rollout)
+    batch = buffer.gather(1.0)(buffer.data, torch.arange(40))
+    assert torch.equal(batch["observation"], rollout["observation"])
+    assert torch.equal(batch["next", "observation"], rollout["next", "observation"])
+    several = SerialEnv(2, partial(GymEnv, "Pendulum-v1"))
+    assert data.ReplayBuffer(several, 100).env_name == "SerialEnv"
+
+
+def test_evicted_frames_are_warned_of_once(caplog):
+    env = envs.make("Pendulum-v1", num_envs=1)
+    buffer = data.ReplayBuffer(env, 16)
+    observations = torch.arange(20.0).view(-1, 1).expand(-1, 3)
+    for first in range(3):
+        buffer.extend(hand_made(observations + 100 * first, torch.zeros(19), truncated=range(19)))
+    assert [record.message for record in caplog.records] == [
+        "episodes end more often than the replay has room for final observations (2): it keeps 2 frames of its 16; "
+        "ReplayBuffer(final_rows=...) is that room"
+    ]

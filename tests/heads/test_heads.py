@@ -72,7 +72,13 @@ def test_bins_take_the_least_of_the_means():
 
 
 @pytest.mark.parametrize(
-    "make", [partial(heads.Quantiles, 3, drop=3), partial(heads.Bins, 1, 1), partial(heads.Categorical, 0, 1, 1)]
+    "make",
+    [
+        partial(heads.Quantiles, 3, drop=3),
+        partial(heads.Quantiles, kappa=0.0),
+        partial(heads.Bins, 1, 1),
+        partial(heads.Categorical, 0, 1, 1),
+    ],
 )
 def test_settings_that_mean_nothing_are_refused(make):
     with pytest.raises(UserError):

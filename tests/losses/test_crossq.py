@@ -82,3 +82,21 @@ def test_gradients_reach_the_right_parameters():
     actor = modules.tanh_normal_actor(env, encoder=modules.Encoder(env, partial(modules.batch_renorm_mlp, hidden=(8,))))
     loss = losses.CrossQLoss(actor, modules.q_value(env, 2, body=partial(modules.batch_renorm_mlp, hidden=(8,))))
     assert_each_term_trains_its_own(loss, loss(batch()))
+
+
+def test_batch_statistics_are_used_in_a_list_of_critics_as_in_an_ensemble():
+    env = envs.make("Pendulum-v1")
+    body = partial(modules.batch_renorm_mlp, hidden=(8,))
+    actor = modules.tanh_normal_actor(env, (8,))
+    critics = modules.q_value(env, 2, body=body)
+    several = losses.CrossQLoss(actor, [modules.q_value(env, 1, body=body) for _ in range(2)])
+    together = losses.CrossQLoss(actor, critics)
+    for key, x in several.qvalue_network_params.items(True, True):
+        together.qvalue_network_params[key].data.copy_(x.data.squeeze(1))  # [2, 1, ...]
+    data, results = batch(), []
+    for loss in (several, together):
+        torch.manual_seed(0)
+        results.append(loss(data)["loss_qvalue"])
+    torch.testing.assert_close(*results)
+    for loss in (several, together):
+        assert all((x == 1).all() for key, x in loss.qvalue_network_params.items(True, True) if key[-1] == "steps")

@@ -279,3 +279,16 @@ def test_indices_with_a_trailing_1_are_no_one_hot_actions():
     one_hot = torch.nn.functional.one_hot(index, 3)
     for action in (index, index.unsqueeze(-1), one_hot):
         torch.testing.assert_close(_chosen(q, action), expected)
+
+
+def test_a_list_of_single_critics_is_an_ensemble_of_them():
+    env = envs.make("CartPole-v1")
+    actor, singles = modules.categorical_actor(env, (8,)), [modules.discrete_q_value(env, 1, (8,)) for _ in range(3)]
+    loss = losses.DiscreteSACLoss(actor, singles)
+    data = batch(dtype=torch.float32)
+    value = loss.action_values(data, loss.qvalue_network_params)
+    expected = torch.cat([single(data.copy())["action_value"] for single in singles], 1)
+    torch.testing.assert_close(value, expected)
+    index = torch.tensor([2, 0])
+    torch.testing.assert_close(loss.action_values(data, loss.qvalue_network_params, index), expected[:, index])
+    assert loss(data)["loss_qvalue"] > 0

@@ -169,3 +169,47 @@ def test_every_loss_takes_every_head(make, head):
     data = batch()
     assert_each_term_trains_its_own(loss, loss(data))
     assert data["td_error"].shape == data.batch_size
+
+
+class Gain(torch.nn.Module):
+    """A layer whose weight has no dimension of the critics."""
+
+    def __init__(self):
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.rand(8))
+
+    def forward(self, x):
+        return x * self.weight
+
+
+def test_some_critics_of_layers_that_all_of_them_share():
+    env = envs.make("Pendulum-v1")
+
+    def body(num, features):
+        return [modules.EnsembleLinear(num, features, 8, gain=1.0), Gain()], 8
+
+    loss = losses.SACLoss(modules.tanh_normal_actor(env, (8,)), modules.q_value(env, 8, body=body), subset=2)
+    data, index = batch(), torch.tensor([4, 0])
+    whole = loss.returns(data, data["action"], loss.qvalue_network_params)
+    torch.testing.assert_close(
+        loss.returns(data, data["action"], loss.qvalue_network_params, index), whole[..., index, :]
+    )
+
+
+def test_dropout_in_a_list_of_critics():
+    env = envs.make("Pendulum-v1")
+    actor = modules.tanh_normal_actor(env, (8,))
+    single = modules.q_value(env, 1, (64,), dropout=0.5)
+    loss, data = losses.SACLoss(actor, [single, single]), batch()
+    loss.qvalue_network_params.apply(lambda x: x.data.copy_(x.data[:1].expand_as(x)))
+    value = loss.q(data, data["action"], loss.qvalue_network_params)
+    assert not torch.allclose(value[:, 0], value[:, 1])
+    loss.set_vmap_randomness("same")
+    value = loss.q(data, data["action"], loss.qvalue_network_params)
+    torch.testing.assert_close(value[:, 0], value[:, 1])
+
+
+def test_values_are_not_taken_for_quantiles():
+    env = envs.make("Pendulum-v1")
+    with pytest.raises(UserError, match=r"needs 25 outputs of each of the 5 critics, there are \(32, 5\): give"):
+        losses.TQCLoss(modules.tanh_normal_actor(env, (8,)), modules.q_value(env, 5, (8,)))(batch())

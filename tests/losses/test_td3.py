@@ -6,6 +6,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.data import Composite, Unbounded
+from torchrl.modules import ProbabilisticActor, TanhDelta
 from torchrl.objectives import SoftUpdate
 from torchrl.objectives import TD3Loss as TorchRLTD3Loss
 
@@ -224,3 +225,24 @@ def test_a_spec_may_be_the_actor_s_composite_and_must_have_bounds():
     assert loss.max_action.shape == (1,) and loss.max_action == 2
     with pytest.raises(UserError, match="must be Bounded"):
         losses.TD3Loss(actor, critics, action_spec=Unbounded(1))
+
+
+def test_an_actor_whose_distribution_is_a_single_action_is_deterministic():
+    env = envs.make("Pendulum-v1")
+    net = TensorDictModule(nn.Linear(3, 1), in_keys=["observation"], out_keys=["param"])
+    bounds = {"low": -2.0, "high": 2.0}
+    actor = ProbabilisticActor(net, in_keys=["param"], distribution_class=TanhDelta, distribution_kwargs=bounds)
+    critics = modules.q_value(env, 2, (8,))
+    loss = losses.TD3Loss(actor, critics, action_spec=env.action_spec_unbatched)
+    SoftUpdate(loss, tau=0.1)
+    data = batch(obs=3, actions=1, dtype=torch.float32)
+    out = loss(data)
+    value = critics(TensorDict({"observation": data["observation"], "action": actor(data.copy())["action"]}, [32]))
+    torch.testing.assert_close(out["loss_actor"], -value["state_action_value"][:, 0].mean())
+    assert torch.autograd.grad(out["loss_actor"], net.module.weight)[0].any()
+
+
+def test_importance_weights_with_a_trailing_1():
+    (loss, data), weights = by_hand(), torch.tensor([0.0, 0.5, 1.0], dtype=torch.float64)
+    flat = loss(data.copy().set("priority_weight", weights))["loss_qvalue"]
+    torch.testing.assert_close(loss(data.copy().set("priority_weight", weights.unsqueeze(-1)))["loss_qvalue"], flat)

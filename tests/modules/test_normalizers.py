@@ -64,3 +64,9 @@ def test_return_scale_does_not_feed_itself():
 
     assert run(True) == pytest.approx(1.8, rel=0.1)
     assert run(False) > 50
+
+
+def test_whole_numbers_are_taken_in():
+    normalizer = modules.ObsNormalizer((2,))
+    normalizer.update(torch.tensor([[0, 10], [4, 10]], dtype=torch.uint8))
+    torch.testing.assert_close(normalizer.mean, torch.tensor([2.0, 10.0]))

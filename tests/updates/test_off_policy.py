@@ -2,6 +2,7 @@
 
 import copy
 
+import gymnasium as gym
 import pytest
 import torch
 from tensordict import TensorDict
@@ -314,3 +315,62 @@ def test_priorities_under_another_key_and_a_loss_without_any():
         updates.OffPolicyUpdate(
             loss, steps, torch.optim.Adam(loss.parameters()), **{**settings, "learning_starts": 62}
         )(rollout)
+
+
+def test_short_episodes_delay_no_update():
+    """Of episodes of one step the replay keeps an eighth of its capacity, less than learning_starts."""
+
+    class Bandit(gym.Env):
+        observation_space = action_space = gym.spaces.Box(-1, 1, (1,))
+
+        def reset(self, *, seed=None, options=None):
+            super().reset(seed=seed)
+            return self.np_random.uniform(-1, 1, 1).astype("f4"), {}
+
+        def step(self, action):
+            return self.reset()[0], 1.0, True, False, {}
+
+    env = envs.make(Bandit, num_envs=2, seed=1)
+    actor = modules.tanh_normal_actor(env, (8,))
+    loss = losses.SACLoss(actor, modules.q_value(env, 2, (8,)))
+    update = updates.OffPolicyUpdate(
+        loss, data.ReplayBuffer(env, 400), torch.optim.Adam(loss.parameters()), batch_size=16, learning_starts=100,
+        updates_per_step=0.25, compile="off",
+    )  # fmt: skip
+    for rollout in collectors.VectorCollector(env, actor, frames_per_batch=20, total_frames=400, compile="off"):
+        update(rollout)
+    assert len(update.buffer) < 100 and update.updates == (400 - 80) / 4
+
+
+def test_torchrl_s_n_step_returns_of_several_environments_are_refused():
+    env = envs.make("Pendulum-v1", num_envs=2)
+    actor = modules.tanh_normal_actor(env, (8,))
+    loss = losses.SACLoss(actor, modules.q_value(env, hidden=(8,)))
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(100), transform=MultiStepTransform(3, 0.99))
+    update = updates.OffPolicyUpdate(loss, buffer, torch.optim.Adam(loss.parameters()), batch_size=8, learning_starts=8)
+    with pytest.raises(UserError, match="MultiStepTransform would add up rewards of 2 environments.*n_steps="):
+        update(collectors.VectorCollector(env, actor, frames_per_batch=16, compile="off").rollout())
+
+
+def test_targets_have_the_normalizer_s_present_statistics():
+    env = envs.make("Pendulum-v1")
+    normalizer = modules.ObsNormalizer(env)
+    actor = modules.tanh_normal_actor(env, (8,), normalizer=normalizer)
+    loss = losses.SACLoss(actor, modules.q_value(env, hidden=(8,), normalizer=normalizer))
+    update = updates.OffPolicyUpdate(
+        loss, data.ReplayBuffer(env, 100), torch.optim.Adam(loss.parameters()), batch_size=8, learning_starts=8,
+        compile="off",
+    )  # fmt: skip
+    rollout = collectors.VectorCollector(env, actor, frames_per_batch=16, compile="off").rollout()
+    normalizer.update(rollout["observation"])
+    seen = []
+    forward = loss.forward
+
+    def spied(batch):
+        targets = loss.target_qvalue_network_params
+        seen.extend(targets[key].clone() for key in targets.keys(True, True) if key[-1] == "mean")
+        return forward(batch)
+
+    loss.forward = spied
+    update(rollout)
+    assert len(seen) >= 16 and all(torch.equal(mean, normalizer.mean) for mean in seen)
