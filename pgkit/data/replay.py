@@ -219,9 +219,9 @@ class ReplayBuffer:
             if oldest > self.start and not self._warned:
                 self._warned = True
                 getLogger("pgkit").warning(
-                    "episodes end more often than the replay has room for final observations (%d): it keeps %d frames "
-                    "of its %d; ReplayBuffer(final_rows=...) is that room",
-                    self.final_rows, self.written - oldest, self.capacity,
+                    "episodes end more often than the replay has room for final observations (%d): old frames leave "
+                    "before there are %d; ReplayBuffer(final_rows=...) is that room",
+                    self.final_rows, self.capacity,
                 )  # fmt: skip
             self.start = max(self.start, oldest)
             self.owner[slots] = frames[part]

@@ -116,8 +116,8 @@ class EnsembleBatchRenorm(nn.Module):
             late = (self.steps >= self.warmup).to(x.dtype)
             r = 1 + late * ((std / running).clamp(1 / self.r_max, self.r_max) - 1)
             d = late * ((mean - self.mean) / running).clamp(-self.d_max, self.d_max)
-            self.mean.lerp_(mean, self.momentum)
-            self.var.lerp_(var, self.momentum)
+            self.mean.add_(self.momentum * (mean - self.mean))
+            self.var.add_(self.momentum * (var - self.var))
             self.steps.add_(1)
         return ((x - mean) / std * r + d) * self.weight + self.bias
 

@@ -285,6 +285,7 @@ def test_a_list_of_single_critics_is_an_ensemble_of_them():
     env = envs.make("CartPole-v1")
     actor, singles = modules.categorical_actor(env, (8,)), [modules.discrete_q_value(env, 1, (8,)) for _ in range(3)]
     loss = losses.DiscreteSACLoss(actor, singles)
+    SoftUpdate(loss, tau=0.1)
     data = batch(dtype=torch.float32)
     value = loss.action_values(data, loss.qvalue_network_params)
     expected = torch.cat([single(data.copy())["action_value"] for single in singles], 1)
