@@ -104,7 +104,7 @@ class DiscreteSACLoss(SoftQLoss):
             return log_prob.exp(), log_prob
         return straight_through_sample(log_prob, self.relaxation), log_prob
 
-    def action_values(self, batch: TensorDictBase, params: Any, members: Tensor | None = None) -> Tensor:
+    def action_values(self, batch: TensorDictBase, params: Any, members: Tensor | slice | None = None) -> Tensor:
         """The values ``[*B, critics, actions]`` at the batch's observations, of the critics ``members`` or of all."""
         data, key = batch.select(*self.qvalue_network.in_keys), self.tensor_keys.action_value
         params, members = self.params_of(params, members)
