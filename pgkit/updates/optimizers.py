@@ -7,7 +7,7 @@ at any time.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -21,6 +21,7 @@ from torch.optim.sgd import sgd
 from pgkit.compiling import computed_once
 
 Apply = Callable[[list[Tensor]], None]
+Functional = tuple[Apply, Callable[[], None], list[Tensor]]
 
 
 class Together:
@@ -68,10 +69,10 @@ def parameters(optimizer: Optimizer) -> list[Tensor]:
     return [p for group in optimizer.param_groups for p in group["params"]]
 
 
-def functional(
-    optimizer: Optimizer, fused: bool, params: list[Tensor] | None = None
-) -> tuple[Apply, Callable[[], None], list[Tensor]] | None:
-    """``(apply, read_learning_rates, rates)`` for Adam, AdamW, SGD and RMSprop, or None for any other optimizer.
+def functional(optimizer: Any, fused: bool, params: list[Tensor] | None = None) -> Functional | None:
+    """``(apply, read_learning_rates, rates)`` for Adam, AdamW, SGD and RMSprop, and for several of these ``Together``.
+
+    None for any other optimizer.
 
     ``apply(grads)`` takes one gradient a parameter, in the order of :func:`parameters`, and can be traced.
     ``read_learning_rates()`` copies the groups' ``lr`` into the tensors ``rates`` that the trace uses: annealing an
@@ -82,6 +83,8 @@ def functional(
         fused: use the fused kernel, which is fastest where nothing is compiled.
         params: step on these alone, in the order of :func:`parameters`; None: all.
     """
+    if isinstance(optimizer, Together):
+        return _together(optimizer, fused, parameters(optimizer) if params is None else params)
     make = {Adam: _adam, AdamW: _adam, SGD: _sgd, RMSprop: _rmsprop}.get(type(optimizer))
     if make is None or any(group.get("capturable") or group.get("differentiable") for group in optimizer.param_groups):
         return None
@@ -93,19 +96,43 @@ def functional(
     rates = [torch.as_tensor(g["lr"], dtype=g["params"][0].dtype, device=g["params"][0].device) for g in groups]
     rates = [rate.clone() for rate in rates]
     applies = [make(optimizer, group, rate, fused) for group, rate in zip(groups, rates, strict=True)]
-    sizes = [len(group["params"]) for group in groups]
-
-    def apply(grads: list[Tensor]) -> None:
-        start = 0
-        for size, apply_group in zip(sizes, applies, strict=True):
-            apply_group(grads[start : start + size])
-            start += size
 
     def read_learning_rates() -> None:
         for group, rate in zip(sources, rates, strict=True):
             rate.fill_(group["lr"])
 
-    return apply, read_learning_rates, rates
+    return _in_turn(applies, [len(group["params"]) for group in groups]), read_learning_rates, rates
+
+
+def _together(optimizer: Together, fused: bool, params: list[Tensor]) -> Functional | None:
+    kept = {id(p) for p in params}
+    owned = [[p for p in parameters(part) if id(p) in kept] for part in optimizer.parts]
+    parts = [functional(part, fused, own) for part, own in zip(optimizer.parts, owned, strict=True) if own]
+    if any(part is None for part in parts):
+        return None
+    applies, readers, rates = zip(*(part for part in parts if part is not None), strict=True)
+
+    def read_learning_rates() -> None:
+        for read in readers:
+            read()
+
+    return (
+        _in_turn(applies, [len(own) for own in owned if own]),
+        read_learning_rates,
+        [x for some in rates for x in some],
+    )
+
+
+def _in_turn(applies: Sequence[Apply], sizes: Sequence[int]) -> Apply:
+    """All of ``applies``, on so many gradients each."""
+
+    def apply(grads: list[Tensor]) -> None:
+        start = 0
+        for size, apply_some in zip(sizes, applies, strict=True):
+            apply_some(grads[start : start + size])
+            start += size
+
+    return apply
 
 
 def _state(optimizer: Optimizer, group: dict[str, Any], *names: str) -> list[list[Tensor]]:

@@ -70,6 +70,24 @@ def test_every_optimizer_compiles(optimizer):
     torch.testing.assert_close(parameters(a), parameters(b), rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.parametrize("mode", ["off", "on"])
+def test_several_optimizers_together_are_part_of_the_step(mode, monkeypatch):
+    def two(parameters, lr):
+        return updates.Together(
+            torch.optim.Adam(parameters[:5], lr=lr), torch.optim.SGD(parameters[5:], lr=0.1, momentum=0.9)
+        )
+
+    update, twin = make_agent(compile=mode, optimizer=two, epochs=1), make_agent(optimizer=two, epochs=1)
+    monkeypatch.setattr(update.optimizer, "step", lambda: pytest.fail("stepped outside the graph"))
+    for i in range(2):
+        update.optimizer.param_groups[1]["lr"] = twin.optimizer.param_groups[1]["lr"] = 0.1 * (i + 1)
+        with monkeypatch.context() as patch:
+            patch.setattr(optimizers, "functional", lambda *_, **__: None)  # the twin's are torch's own steps
+            expected = twin(make_rollout(i))
+        assert update(make_rollout(i)) == pytest.approx(expected, rel=1e-4, abs=1e-5)
+        torch.testing.assert_close(parameters(update), parameters(twin), rtol=1e-4, atol=1e-5)
+
+
 def test_a_recorded_advantage_follows_weights_and_settings_and_leaves_other_layouts_to_the_block():
     update = make_agent(compile="on", epochs=1, minibatch_size=None)
     update(make_rollout())
