@@ -119,7 +119,7 @@ def _together(optimizer: Together, fused: bool, params: list[Tensor]) -> Functio
     return (
         _in_turn(applies, [len(own) for own in owned if own]),
         read_learning_rates,
-        [x for some in rates for x in some],
+        [rate for some in rates for rate in some],
     )
 
 
