@@ -9,7 +9,7 @@ import math
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torchrl.data import LazyTensorStorage
@@ -96,7 +96,8 @@ def main(args: Args) -> None:
         if args.alpha is not None:
             temperature = controllers.FixedTemperature(args.alpha)
         else:
-            target_entropy = args.target_entropy_weight * math.log(critics.module.actions)
+            actions: Any = env.action_spec_unbatched.space
+            target_entropy = args.target_entropy_weight * math.log(actions.n)
             temperature = controllers.Temperature(target_entropy, args.alpha_init)
 
         buffer = data.ReplayBuffer(

@@ -10,6 +10,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.objectives import LossModule
 
+from pgkit.errors import UserError
 from pgkit.functional import listed
 
 
@@ -31,6 +32,20 @@ class Loss(LossModule):
         self._in_keys = self._out_keys = None
         super().__init__()
         self.reduction = "mean" if reduction is None else reduction
+
+    def convert_to_functional(self, module: Any, module_name: str, *args: Any, **kwargs: Any) -> None:
+        """As in TorchRL, after a check that ``module`` says what it reads and writes.
+
+        Raises:
+            UserError: it is no TensorDict module.
+        """
+        for network in module if isinstance(module, list | tuple) else [module]:
+            if not hasattr(network, "in_keys"):
+                raise UserError(
+                    f"{type(self).__name__} takes TensorDict modules, its {module_name} is a {type(network).__name__}: "
+                    "wrap it, tensordict.nn.TensorDictModule(net, in_keys=[...], out_keys=[...])"
+                )
+        super().convert_to_functional(module, module_name, *args, **kwargs)
 
     def __getattr__(self, item: str) -> Any:
         if item.startswith("target_") and item.endswith("_params") and self._modules.get(item) is None:

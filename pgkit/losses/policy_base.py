@@ -14,6 +14,7 @@ from torch.distributions import Distribution, kl_divergence
 from torchrl.modules.distributions.utils import sample_and_log_prob
 from torchrl.objectives.utils import ValueEstimators, dispatch_value_estimator
 
+from pgkit.errors import UserError
 from pgkit.functional import approx_kl, listed, same_shape
 from pgkit.losses.base import Loss
 
@@ -61,6 +62,11 @@ class PolicyLoss(Loss):
     ) -> None:
         super().__init__(reduction)
         self.convert_to_functional(actor_network, "actor_network")
+        if not hasattr(actor_network, "dist_sample_keys"):
+            raise UserError(
+                f"{type(self).__name__} needs an actor that draws from a distribution (modules.gaussian_actor, "
+                "modules.actor), this one gives one action: losses.TD3Loss and losses.DDPGLoss take it"
+            )
         if critic_network is None:
             self.critic_network = None
         else:

@@ -150,6 +150,11 @@ class SoftQLoss(QLoss):
 
 
 def _check_actions(loss: str, actor: TensorDictModule, discrete: bool) -> None:
+    if hasattr(actor, "in_keys") and not hasattr(actor, "dist_sample_keys"):
+        raise UserError(
+            f"{loss} needs an actor that draws from a distribution (modules.tanh_normal_actor), this one gives one "
+            "action: losses.TD3Loss and losses.DDPGLoss take it"
+        )
     for module in actor.modules():
         kind = getattr(module, "distribution_class", None)
         if kind is None or discrete == (not getattr(kind, "has_rsample", True)):

@@ -27,7 +27,9 @@ def choose(args: RunArgs, recipe: str) -> Path:
     if path.exists() and not path.is_dir():
         raise UserError(f"--run-dir {path} is a file; give a directory")
     if holds_run(path):
-        raise UserError(f"{path} already holds a run: give another --run-dir, or go on with it by --resume {path}")
+        saved = (path / "checkpoints" / "latest.pt").exists()
+        way = f"or go on with it by --resume {path}" if saved else "or delete it: it has no checkpoint to go on from"
+        raise UserError(f"{path} already holds a run: give another --run-dir, {way}")
     return path
 
 

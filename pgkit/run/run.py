@@ -1,5 +1,7 @@
 """One training run, as a recipe holds it: log a step, and evaluation and checkpoints follow when due."""
 
+import logging
+import math
 import shlex
 import signal
 import threading
@@ -50,7 +52,7 @@ class Run:
         self._clock = Clock(already=counters.get("wall_s", 0.0))
         self._tracked: dict[str, checkpoint.Stateful] = {}
         self._eval: Any = None
-        self._interrupted = False
+        self._interrupted = self._diverged = False
 
     def _load(self) -> dict[str, Any]:
         config = directory.read_config(self.dir)
@@ -131,6 +133,7 @@ class Run:
         }
         row |= {name if "/" in name else f"train/{name}": value for name, value in averages(self._recent).items()}
         self._recent = []
+        self._warn_of_divergence(row)
         self._live.update(frames, row["rollout/ep_rew_mean"], row["time/fps"])
         if due:
             row |= self._evaluate(row)
@@ -139,6 +142,18 @@ class Run:
             self.save()
         if self._interrupted:
             raise KeyboardInterrupt
+
+    def _warn_of_divergence(self, row: Mapping[str, float]) -> None:
+        lost = [name for name, value in row.items() if name.startswith("train/") and not math.isfinite(value)]
+        if lost and not self._diverged:
+            self._diverged = True
+            logging.getLogger("pgkit").warning(
+                "%s is %s at %s frames: the training has diverged; stop it (Ctrl-C) and start again with lower "
+                "learning rates or a lower --max-grad-norm",
+                lost[0],
+                row[lost[0]],
+                f"{row['frames']:,}",
+            )
 
     def _eval_env(self) -> Any:
         if self._eval is None:

@@ -43,8 +43,8 @@ class RunArgs:
     compile: Literal["auto", "on", "off"] = "auto"
     """Compile the update into one graph; auto: when the run is long enough to win the compile time back."""
     resume: Path | None = None
-    """Run directory to go on with. Its settings are taken over; other flags given here override them, but what the
-    checkpoint holds (learning rates, coefficients) stays."""
+    """Run directory to go on with, by its own settings: only the length, evaluation, logging, workers, threads and
+    compilation may be given anew."""
     threads: int = 1
     """Threads that PyTorch uses in this process; 1 is fastest for small networks."""
     explain: bool = False
@@ -59,21 +59,23 @@ _BOUNDS: dict[str, tuple[float, float]] = {
     **dict.fromkeys(("hidden", "critic_hidden", "sequence_length", "memory_size"), (1, math.inf)),
     **dict.fromkeys(("cg_steps", "critic_epochs"), (1, math.inf)),
     **dict.fromkeys(("old_rollouts", "delay", "backtracks", "damping", "max_kl", "kl_target"), (0, math.inf)),
-    **dict.fromkeys(("beta", "priority_alpha", "priority_beta"), (0, math.inf)),
-    **dict.fromkeys(("seed", "eval_every", "random_frames", "updates_per_step", "max_grad_norm"), (0, math.inf)),
+    **dict.fromkeys(("beta", "priority_alpha", "priority_beta", "critic_coeff", "target_kl"), (0, math.inf)),
+    **dict.fromkeys(("exploration_noise", "policy_noise", "noise_clip", "noise", "rho_thresh"), (0, math.inf)),
+    "seed": (0, 2**62),
+    **dict.fromkeys(("eval_every", "random_frames", "updates_per_step", "max_grad_norm"), (0, math.inf)),
     **dict.fromkeys(("learning_rate", "q_learning_rate", "alpha_learning_rate", "clip_epsilon"), (0, math.inf)),
-    **dict.fromkeys(("gamma", "lmbda", "tau"), (0, 1)),
+    **dict.fromkeys(("gamma", "lmbda", "tau", "epsilon_end"), (0, 1)),
     "alpha": (0, math.inf),
+    "beta1": (0, 0.9999),
     "dropout": (0, 0.99),
     "alpha_init": (1e-8, math.inf),
 }
 
-# what a checkpoint holds, in the optimizer, the networks, and the coefficients of loss, advantage and exploration
-_IN_CHECKPOINT = (
-    "learning_rate", "q_learning_rate", "alpha_learning_rate", "beta1", "gamma", "lmbda", "clip_epsilon",
-    "entropy_coeff", "critic_coeff", "log_std", "alpha", "alpha_init", "beta", "policy_noise", "noise_clip",
-    "epsilon_end", "v_min", "v_max", "noise",
-)  # fmt: skip
+# what a resumed run may change: how long, how fast and how closely watched it goes on
+_FREE_ON_RESUME = {
+    "total_frames", "eval_every", "eval_episodes", "log_every", "workers", "threads", "compile", "save_buffer",
+    "buffer_dir", "explain", "resume",
+}  # fmt: skip
 
 A = TypeVar("A", bound=RunArgs)
 Presets = Mapping[str, Mapping[str, Any]]
@@ -178,6 +180,8 @@ def check(args: RunArgs) -> None:
     for name, (least, most) in _BOUNDS.items():
         value = getattr(args, name, None)
         for number in value if isinstance(value, tuple) else (value,):
+            if isinstance(number, float) and not math.isfinite(number):
+                raise UserError(f"--{name.replace('_', '-')} {number}: give a finite number")
             if isinstance(number, int | float) and not least <= number <= most:
                 bound = f"at least {least:g}" if number < least else f"at most {most:g}"
                 raise UserError(f"--{name.replace('_', '-')} {number}: give {bound}")
@@ -242,11 +246,12 @@ def _check_resumed(saved: RunArgs, args: RunArgs) -> None:
     for name, why in {"env_id": "that run trains on", "run_dir": "a resumed run goes on in"}.items():
         if getattr(args, name) != getattr(saved, name):
             raise UserError(f"--{name.replace('_', '-')} {getattr(args, name)}: {why} {getattr(saved, name)}")
-    for name in _IN_CHECKPOINT:
+    for field in dataclasses.fields(args):
+        name, kept = field.name, getattr(saved, field.name)
         annealed = name == "learning_rate" and getattr(args, "anneal", False)
-        if not annealed and getattr(args, name, None) != getattr(saved, name, None):
-            flag, kept = f"--{name.replace('_', '-')} {getattr(args, name)}", getattr(saved, name)
-            raise UserError(f"{flag}: a resumed run keeps its checkpoint's, {kept}; another value needs a new run")
+        if name not in _FREE_ON_RESUME and not annealed and getattr(args, name) != kept:
+            flag = f"--{name.replace('_', '-')} {getattr(args, name)}"
+            raise UserError(f"{flag}: a resumed run keeps its own, {kept}; another value needs a new run")
     if getattr(args, "anneal", False) and args.total_frames != saved.total_frames:
         frames = f"{args.total_frames:,}, no longer {saved.total_frames:,} frames"
         print(f"the learning rate anneals to zero at {frames}: it jumps where the run goes on")

@@ -12,7 +12,7 @@ from torch.optim import Optimizer
 from pgkit.compiling import worth_compiling
 from pgkit.data import ReplayBuffer
 from pgkit.errors import UserError
-from pgkit.updates import optimizers, wiring
+from pgkit.updates import optimizers, restoring, wiring
 from pgkit.updates.batches import Batches, OwnBatches, TorchRLBatches
 from pgkit.updates.chain import Chain
 from pgkit.updates.diagram import diagram
@@ -130,7 +130,7 @@ class OffPolicyUpdate:
         return metrics
 
     def __str__(self) -> str:
-        norm = f"gradient norm at most {self.max_grad_norm:g}, " if self.max_grad_norm else ""
+        norm = f"gradient norm at most {self.max_grad_norm:g}, " if self.max_grad_norm is not None else ""
         delay = f"the actor once in {self.actor_delay} steps, " if self.actor_delay > 1 else ""
         tau = "" if self._average is None else f"targets move by {self.tau:g}, "
         step = (
@@ -154,7 +154,7 @@ class OffPolicyUpdate:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restores :meth:`state_dict`; with an empty replay, training waits for ``learning_starts`` frames."""
-        self.loss.load_state_dict(state["loss"])
+        restoring.load(self.loss, state["loss"])
         self.optimizer.load_state_dict(state["optimizer"])
         self.frames, self.updates, self._due = state["counters"]
         self._steps = {}

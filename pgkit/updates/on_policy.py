@@ -16,7 +16,7 @@ from torch.optim import Optimizer
 from pgkit.compiling import worth_compiling
 from pgkit.errors import UserError
 from pgkit.functional import standardize
-from pgkit.updates import wiring
+from pgkit.updates import restoring, wiring
 from pgkit.updates.chain import Chain
 from pgkit.updates.diagram import diagram
 from pgkit.updates.recorded import Block, recorded_block
@@ -45,7 +45,7 @@ class OnPolicyUpdate:
             name an attribute of the loss such as ``entropy_coeff``. Needs ``total_frames``.
         total_frames: frames of the whole training, for schedules and for ``compile="auto"``.
         compile: ``on``, ``off``, or ``auto``: where a C++ compiler is there and at least 30,000 steps are expected, or
-            their number is not known. Compiling costs 20 to 40 seconds once and saves about one millisecond a step.
+            their number is not known. Compiling costs 10 to 40 seconds once and saves about one millisecond a step.
         seed: of the minibatch order; by default drawn from torch's global generator.
     """
 
@@ -130,7 +130,7 @@ class OnPolicyUpdate:
 
     def __str__(self) -> str:
         size = self.minibatch_size or "the whole rollout"
-        norm = f"gradient norm at most {self.max_grad_norm:g}, " if self.max_grad_norm else ""
+        norm = f"gradient norm at most {self.max_grad_norm:g}, " if self.max_grad_norm is not None else ""
         step = f"{self.epochs} epochs of minibatches of {size}, {norm}compile {self.compile}"
         return diagram(self, Chain(self.loss, self.advantage), step, self._batch)
 
@@ -151,9 +151,9 @@ class OnPolicyUpdate:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restores :meth:`state_dict`; the compiled step is built again at the next call."""
-        self.loss.load_state_dict(state["loss"])
+        restoring.load(self.loss, state["loss"])
         if isinstance(self.advantage, nn.Module):
-            self.advantage.load_state_dict(state["advantage"])
+            restoring.load(self.advantage, state["advantage"])
         self.optimizer.load_state_dict(state["optimizer"])
         self._generator.set_state(state["generator"])
         self.frames = state["frames"]

@@ -47,7 +47,7 @@ def check_parameters(chain: Chain, optimizer: Optimizer, total: Tensor) -> None:
         if missing and module is chain.loss:
             raise UserError(
                 f"parameter '{missing[0]}' of {owner}{_more(missing)} is in no group of the optimizer: "
-                "build it from [*actor.parameters(), *critic.parameters()] or freeze the parameter "
+                "build it from loss.parameters() or freeze the parameter "
                 "(requires_grad_(False))"
             )
         if missing:

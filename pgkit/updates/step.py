@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from pgkit.compiling import computed_once
+from pgkit.errors import UserError
 from pgkit.updates import optimizers
 from pgkit.updates.chain import is_loss
 from pgkit.updates.recorded import Step, recorded
@@ -65,6 +66,8 @@ class GradientStep:
         written: Sequence[Tensor] = (),
         may_fall_back: bool = False,
     ) -> None:
+        if max_grad_norm is not None and max_grad_norm <= 0:
+            raise UserError(f"max_grad_norm={max_grad_norm} lets nothing be trained: give a bound above 0, or None")
         self.optimizer, self.loss = optimizer, loss
         self.names = [*names, "grad_norm"]
         self.compile_seconds = 0.0

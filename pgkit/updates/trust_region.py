@@ -13,7 +13,7 @@ from torch.optim import SGD, Optimizer
 from pgkit.compiling import worth_compiling
 from pgkit.errors import UserError
 from pgkit.functional import conjugate_gradient
-from pgkit.updates import wiring
+from pgkit.updates import restoring, wiring
 from pgkit.updates.chain import Chain
 from pgkit.updates.diagram import diagram
 from pgkit.updates.optimizers import parameters
@@ -197,9 +197,9 @@ class TrustRegionUpdate:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restores :meth:`state_dict`; the compiled step is built again at the next call."""
-        self.loss.load_state_dict(state["loss"])
+        restoring.load(self.loss, state["loss"])
         if isinstance(self.advantage, nn.Module):
-            self.advantage.load_state_dict(state["advantage"])
+            restoring.load(self.advantage, state["advantage"])
         if self.optimizer is not None:
             self.optimizer.load_state_dict(state["optimizer"])
         self._generator.set_state(state["generator"])

@@ -126,3 +126,17 @@ def test_what_a_loss_has_no_use_for_is_refused():
         make("TQCLoss", loss_function="l1")
     with pytest.raises(TypeError, match="delay_qvalue"):
         make("CrossQLoss", delay_qvalue=True)
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_networks_that_do_not_fit_are_named(name):
+    kind, env = getattr(losses, name), envs.make("Pendulum-v1")
+    settings = {"action_spec": env.action_spec_unbatched} if name == "TD3Loss" else {}
+    deterministic = name in ("TD3Loss", "DDPGLoss")
+    actor = make(name).actor_network
+    with pytest.raises(UserError, match=f"{name} takes TensorDict modules, its .*_network is a Linear: wrap it"):
+        kind(actor, torch.nn.Linear(3, 1), **settings)
+    other = (modules.gaussian_actor if deterministic else modules.deterministic_actor)(env)
+    message = "needs an actor that gives one action" if deterministic else "needs an actor that draws"
+    with pytest.raises(UserError, match=f"{name} {message}"):
+        kind(other, modules.q_value(env, 1), **settings)

@@ -166,6 +166,19 @@ def test_a_run_without_a_checkpoint_cannot_be_resumed(kit: SimpleNamespace, tmp_
     (tmp_path / "r/checkpoints/latest.pt").unlink()
     with pytest.raises(UserError, match="has no checkpoint"):
         kit.train(arguments(tmp_path / "r", total=80, resume=tmp_path / "r"))
+    with pytest.raises(UserError, match="already holds a run: give another --run-dir, or delete it: it has no checkp"):
+        kit.train(arguments(tmp_path / "r"))
+
+
+def test_a_run_that_diverges_says_so_once(kit: SimpleNamespace, tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    from pgkit.run import Run
+
+    with Run(arguments(tmp_path / "r"), "walk") as log:
+        log.track(policy=kit.policy(), eval_env=kit.Env)
+        for frames in (10, 20, 30):
+            log.step(frames, None, {"loss_actor": 1.0 if frames < 20 else float("nan")})
+    said = [record.getMessage() for record in caplog.records]
+    assert len(said) == 1 and said[0].startswith("train/loss_actor is nan at 20 frames: the training has diverged")
 
 
 def test_an_error_before_track_leaves_no_directory(tmp_path: Path):

@@ -164,6 +164,8 @@ def test_whole_numbers_may_have_an_exponent():
         ({"seed": -1}, "--seed -1: give at least 0"),
         ({"old_rollouts": -1}, "--old-rollouts -1: give at least 0"),
         ({"gamma": 1.5}, "--gamma 1.5: give at most 1"),
+        ({"gamma": float("nan")}, "--gamma nan: give a finite number"),
+        ({"learning_rate": float("inf")}, "--learning-rate inf: give a finite number"),
     ],
 )
 def test_numbers_that_no_run_can_have(setting: dict, message: str):
@@ -196,18 +198,19 @@ def test_a_stretched_annealing_is_said(tmp_path: Path, capsys: pytest.CaptureFix
         ("ppo", "--clip-epsilon"), ("ppo", "--log-std"), ("ppo_penalty", "--beta"), ("sac", "--alpha"),
         ("sac", "--alpha-init"), ("sac", "--beta1"), ("td3", "--policy-noise"), ("td3", "--noise-clip"),
         ("dqn", "--epsilon-end"), ("rainbow", "--v-min"), ("rainbow", "--v-max"), ("rainbow", "--noise"),
+        ("sac", "--updates-per-step"),
     ],
 )  # fmt: skip
-def test_a_flag_that_a_checkpoint_holds_is_refused_on_resume(tmp_path: Path, recipe: str, flag: str):
+def test_other_settings_are_refused_on_resume(tmp_path: Path, recipe: str, flag: str):
     args_class = importlib.import_module(f"recipes.{recipe}").Args
     settings = {key: value for key, value in dataclasses.asdict(args_class()).items() if key != "run_dir"}
     run_dir = saved_run(tmp_path / "run", **settings)
-    with pytest.raises(UserError, match=f"{flag} 0.77: a resumed run keeps its checkpoint's"):
+    with pytest.raises(UserError, match=f"{flag} 0.77: a resumed run keeps its own"):
         parse(args_class, {}, ["--resume", str(run_dir), flag, "0.77"])
 
 
-def test_a_resumed_run_keeps_what_its_checkpoint_holds(tmp_path: Path):
+def test_a_resumed_run_keeps_its_settings_and_may_go_on_longer(tmp_path: Path):
     run_dir = saved_run(tmp_path / "run", env_id="Walk-v0", learning_rate=0.5)
-    with pytest.raises(UserError, match="--learning-rate 0.1: a resumed run keeps its checkpoint's, 0.5"):
+    with pytest.raises(UserError, match="--learning-rate 0.1: a resumed run keeps its own, 0.5"):
         parse(Args, {}, ["--resume", str(run_dir), "--learning-rate", "0.1"])
     assert parse(Args, {}, ["--resume", str(run_dir), "--learning-rate", "0.5", "--eval-every", "7"]).eval_every == 7

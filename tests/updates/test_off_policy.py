@@ -11,7 +11,7 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer, TensorDictReplayBuffer
 from torchrl.envs import MultiStepTransform
 from torchrl.objectives import SACLoss as TorchRLSACLoss
 
-from pgkit import collectors, controllers, data, envs, losses, modules, updates
+from pgkit import collectors, controllers, data, envs, heads, losses, modules, updates
 from pgkit.errors import UserError
 from pgkit.updates.targets import averaging
 
@@ -374,3 +374,13 @@ def test_targets_have_the_normalizer_s_present_statistics():
     loss.forward = spied
     update(rollout)
     assert len(seen) >= 16 and all(torch.equal(mean, normalizer.mean) for mean in seen)
+
+
+def test_a_state_of_other_shapes_is_refused():
+    env = envs.make("Pendulum-v1")
+    made = []
+    for head in (None, heads.Quantiles(5, drop=1)):
+        loss = losses.SACLoss(modules.tanh_normal_actor(env, (8,)), modules.q_value(env, hidden=(8,), head=head))
+        made.append(updates.OffPolicyUpdate(loss, data.ReplayBuffer(env, 2000), torch.optim.Adam(loss.parameters())))
+    with pytest.raises(ValueError, match=r"qvalue_network.* is \(2, 8, 1\) there and \(2, 8, 5\) here"):
+        made[1].load_state_dict(made[0].state_dict())
