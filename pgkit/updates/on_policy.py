@@ -99,7 +99,10 @@ class OnPolicyUpdate:
         self._batch: TensorDictBase | None = None
 
     def __call__(self, rollout: TensorDictBase) -> dict[str, float]:
-        """Trains on a rollout ``[num_envs, T]`` (or any batch shape); metrics are means over the minibatches."""
+        """Trains on a rollout ``[num_envs, T]``; metrics are means over the minibatches.
+
+        Time is the last dimension: flattened, an advantage would run from one environment into the next.
+        """
         self._follow_schedules()
         length = self.sequence_length or 1
         rows = rollout.numel() // length
