@@ -46,14 +46,25 @@ def standardize(x: Tensor, mask: Tensor | None = None) -> Tensor:
 
     A single element becomes zero; a deviation below 1e-6 counts as that.
     """
-    weight = torch.ones_like(x) if mask is None else mask.to(x.dtype)
-    count = weight.sum()
-    centered = x - (weight * x).sum() / count
-    deviation = ((weight * centered.square()).sum() / (count - 1).clamp_min(1)).sqrt()
+    centered, squares, count = _centered(x, mask)
+    deviation = (squares / (count - 1).clamp_min(1)).sqrt()
     return centered / deviation.clamp_min(1e-6)
 
 
-def explained_variance(value: Tensor, target: Tensor) -> Tensor:
-    r""":math:`1 - \text{Var}(target - V) / \text{Var}(target)`: 1 is perfect, 0 no better than the mean. A scalar."""
+def explained_variance(value: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+    r""":math:`1 - \text{Var}(target - V) / \text{Var}(target)`: 1 is perfect, 0 no better than the mean. A scalar.
+
+    Over all elements, or over those of ``mask``, of the same shape.
+    """
     same_shape(value=value, target=target)
-    return 1 - (target - value).var(correction=0) / target.var(correction=0).clamp_min(1e-12)
+    _, unexplained, count = _centered(target - value, mask)
+    _, total, _ = _centered(target, mask)
+    return 1 - unexplained / total.clamp_min(1e-12 * count)
+
+
+def _centered(x: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+    """``x`` less its mean, the sum of the squares of that, and how many elements count."""
+    weight = torch.ones_like(x) if mask is None else mask.to(x.dtype)
+    count = weight.sum()
+    centered = x - (weight * x).sum() / count
+    return centered, (weight * centered.square()).sum(), count

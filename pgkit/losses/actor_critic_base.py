@@ -63,17 +63,21 @@ class ActorCriticLoss(PolicyLoss):
 
     def get_advantage(self, batch: TensorDictBase) -> Tensor:
         """The batch's advantage ``[*B, 1]``, standardized over the batch if this loss does that."""
-        advantage, mask = super().get_advantage(batch), batch.get(("collector", "mask"), None)
-        if not self.normalize_advantage:
-            return advantage
-        return standardize(advantage, None if mask is None else mask.reshape(advantage.shape))
+        advantage = super().get_advantage(batch)
+        return standardize(advantage, self.mask(advantage, batch)) if self.normalize_advantage else advantage
+
+    @staticmethod
+    def mask(entry: Tensor, batch: TensorDictBase) -> Tensor | None:
+        """Which elements of an entry ``[*B, 1]`` are no padding, in its shape; None if the batch has none."""
+        mask = batch.get(("collector", "mask"), None)
+        return None if mask is None else mask.reshape(entry.shape)
 
     def add_entropy(self, out: TensorDict, dist: Distribution, batch: TensorDictBase) -> None:
         """Writes ``loss_entropy`` and ``entropy``, unless there is no entropy bonus."""
         if self.entropy_bonus:
             entropy = self.entropy(dist)
             out["loss_entropy"] = self.reduce(-self.entropy_coeff * entropy, batch)
-            out["entropy"] = entropy.detach().mean()
+            out["entropy"] = self.average(entropy, batch)
 
     def add_critic(self, out: TensorDict, batch: TensorDictBase, name: str = "loss_critic") -> None:
         """Writes the value loss as ``name``, and ``explained_variance``, unless there is no critic."""
@@ -86,7 +90,7 @@ class ActorCriticLoss(PolicyLoss):
             old_value = batch[self.tensor_keys.value]
             error = clipped_value_loss(value, target, old_value, self.clip_value, self.loss_critic_type)
         out[name] = self.reduce(self.critic_coeff * error, batch)
-        out["explained_variance"] = explained_variance(value.detach(), target)
+        out["explained_variance"] = explained_variance(value.detach(), target, self.mask(target, batch))
 
     def _writes(self) -> list[NestedKey]:
         entropy = ["loss_entropy", "entropy"] if self.entropy_bonus else []

@@ -97,3 +97,7 @@ class Loss(LossModule):
         """
         loss = self._reduce_loss(loss, batch)
         return loss.squeeze(-1) if loss.dim() > batch.dim() else loss
+
+    def average(self, entry: Tensor, batch: TensorDictBase) -> Tensor:
+        """The metric ``[]`` of an entry ``[*B]`` or ``[*B, 1]``: its mean without gradient, padded entries left out."""
+        return self._reduce_loss(entry.detach(), batch, reduction="mean")

@@ -110,6 +110,6 @@ class ClipPPOLoss(ActorCriticLoss):
         self.add_critic(out, batch)
 
         ratio = log_ratio.detach().exp()
-        out["approx_kl"] = approx_kl(log_ratio.detach()).mean()
-        out["clip_fraction"] = ((ratio < 1 - low) | (ratio > 1 + high)).to(ratio.dtype).mean()
+        out["approx_kl"] = self.average(approx_kl(log_ratio), batch)
+        out["clip_fraction"] = self.average(((ratio < 1 - low) | (ratio > 1 + high)).to(ratio.dtype), batch)
         return out

@@ -98,8 +98,8 @@ class KLPENPPOLoss(ActorCriticLoss):
         out = TensorDict({"loss_objective": self.reduce(-objective, batch)})
         self.add_entropy(out, dist, batch)
         self.add_critic(out, batch)
-        out["kl"], out["beta"] = kl.detach().mean(), beta
-        out["kl_approx"] = approx_kl(log_ratio.detach()).mean()
+        out["kl"], out["beta"] = self.average(kl, batch), beta
+        out["kl_approx"] = self.average(approx_kl(log_ratio), batch)
         if self.controller is None:
             with torch.no_grad():
                 self.beta.copy_(adapted_coefficient(beta, out["kl"], self.dtarg, self.increment, self.decrement))

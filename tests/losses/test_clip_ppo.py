@@ -5,6 +5,7 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import CompositeDistribution, TensorDictModule
 from torch import nn
+from torch.testing import assert_close
 from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import ClipPPOLoss as TorchRLClipPPOLoss
 from torchrl.objectives.utils import ValueEstimators
@@ -220,12 +221,17 @@ def test_a_composite_action_in_an_update_and_in_vtrace():
     torch.testing.assert_close(scored, batch["action", "steer_log_prob"] + batch["action", "gear_log_prob"])
 
 
-def test_padded_entries_have_no_part_in_the_advantage_s_scale():
+@pytest.mark.parametrize("name", ["ClipPPOLoss", "KLPENPPOLoss", "A2CLoss"])
+def test_padded_entries_have_no_part_in_losses_nor_metrics(name):
     env = envs.make("Pendulum-v1")
-    actor = modules.gaussian_actor(env)
+    actor, critic = modules.gaussian_actor(env), modules.state_value(env)
     batch = make_batch(actor, env, rows=6)
-    loss = losses.ClipPPOLoss(actor, normalize_advantage=True)
-    alone = loss(batch[:4])["loss_objective"]
-    batch["advantage"][4:] = 100
+    batch["value_target"] = torch.randn(6, 1)
+    loss = getattr(losses, name)(actor, critic, normalize_advantage=True)
+    loss.keep_distribution(batch)
+    batch["action_log_prob"] -= 0.3
+    alone = loss(batch[:4].clone()).to_dict()
+    loss = getattr(losses, name)(actor, critic, normalize_advantage=True)
+    batch["advantage"][4:] = batch["value_target"][4:] = batch["observation"][4:] = 100
     batch["collector", "mask"] = torch.tensor([True] * 4 + [False] * 2)
-    torch.testing.assert_close(loss(batch)["loss_objective"], alone)
+    assert_close(loss(batch).to_dict(), alone)
