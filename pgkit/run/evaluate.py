@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from logging import getLogger
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from pgkit.errors import UserError
 from pgkit.run.seeding import preserved_rng
 
 Entries = Mapping[str, torch.Tensor]
+LONG_EPISODE = 100_000  # steps; longer than those of Gymnasium, dm_control and Atari
 
 
 @contextmanager
@@ -92,6 +94,11 @@ def play(policy: torch.nn.Module, env: Any, episodes: int) -> tuple[np.ndarray, 
         while any(len(done) < wanted for done, wanted in zip(finished, share, strict=True)):
             _, _, terminated, truncated = arrays.step(act(arrays.obs, fresh))
             fresh = terminated | truncated
+            if (arrays.step_count[~fresh] == LONG_EPISODE).any():
+                getLogger("pgkit").warning(
+                    "an episode of evaluation has come to %s steps and goes on: does the environment end? "
+                    "envs.make(id, max_episode_steps=...) sets a time limit", f"{LONG_EPISODE:,}",
+                )  # fmt: skip
             for slot in np.flatnonzero(fresh):
                 if len(finished[slot]) < share[slot]:
                     finished[slot].append((float(arrays.episode_reward[slot]), int(arrays.step_count[slot])))

@@ -185,15 +185,15 @@ class OffPolicyUpdate:
     def _critics(self, batch: TensorDictBase) -> dict[str, list[Tensor]]:
         """The critics' loss entries, and the parameters they train."""
         params = optimizers.parameters(self.optimizer)
-        buffers = [(x, x.clone()) for x in self.loss.buffers()]
-        with torch.random.fork_rng(devices=[]):
-            out = self.loss(batch.copy())
-        reached = {}
-        for key in [key for key in ("loss_qvalue", "loss_value", "loss_critic") if key in out.keys()]:
-            grads = torch.autograd.grad(out[key].sum(), params, allow_unused=True, retain_graph=True)
-            reached[key] = [p for p, grad in zip(params, grads, strict=True) if grad is not None]
-        for x, before in buffers:  # statistics that a forward pass updates
-            x.copy_(before)
+
+        def trial() -> dict[str, list[Tensor]]:
+            out, reached = self.loss(batch.copy()), {}
+            for key in [key for key in ("loss_qvalue", "loss_value", "loss_critic") if key in out.keys()]:
+                grads = torch.autograd.grad(out[key].sum(), params, allow_unused=True, retain_graph=True)
+                reached[key] = [p for p, grad in zip(params, grads, strict=True) if grad is not None]
+            return reached
+
+        reached = restoring.undone(self.loss.buffers(), trial)
         if not reached:
             raise UserError(f"actor_delay needs a critics' loss (loss_qvalue), {type(self.loss).__name__} has none")
         return reached

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from logging import getLogger
-from typing import Any, cast
+from typing import cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -15,6 +15,7 @@ from torch.fx import GraphModule, Node
 
 from pgkit.compiling import compile_record, record
 from pgkit.updates.decisions import Decisions
+from pgkit.updates.restoring import undone
 
 Block = Callable[[TensorDictBase], TensorDictBase]
 Result = tuple[Tensor, list[Tensor]]
@@ -44,7 +45,7 @@ def recorded(step: Step, held: Sequence[Tensor], data: TensorDictBase, index: Te
     first, decisions = _graph(step, held, data, index)
     for shift in range(1, 5):  # a decision taken on values outside torch (numpy) is not seen: it shows on other rows
         other = (index + shift * (len(index) + 1)) % (index.max() + 1)
-        expected, got = (_undone(held, lambda f=f, rows=other: f(data, rows)) for f in (step, first))
+        expected, got = (undone(held, lambda f=f, rows=other: f(data, rows)) for f in (step, first))
         if got is None and decisions.numbers:
             raise RuntimeError("the step reads a number off a tensor, and it is another on other rows")
         if got is not None and not torch.allclose(got[0], expected[0], rtol=1e-3, atol=1e-4, equal_nan=True):
@@ -93,7 +94,7 @@ def _graph(
                 tensor.copy_(torch.where(as_recorded, tensor, value))
         return [as_recorded, metrics, *grads]
 
-    graph = _undone(held, lambda: record(flat, [*held, *(data[key] for key in keys), index]))
+    graph = undone(held, lambda: record(flat, [*held, *(data[key] for key in keys), index]))
     memory = {tensor.untyped_storage().data_ptr() for tensor in held}
     for node in graph.graph.find_nodes(op="get_attr"):
         constant = getattr(graph, str(node.target))
@@ -130,18 +131,6 @@ def _is_written(node: Node) -> bool:
     return False
 
 
-def _undone(tensors: Sequence[Tensor], function: Callable[[], Any]) -> Any:
-    """The function's result; what it did to these tensors and to the random generator is undone."""
-    before = [tensor.detach().clone() for tensor in tensors]
-    try:
-        with torch.random.fork_rng(devices=[]):
-            return function()
-    finally:
-        with torch.no_grad():
-            for tensor, value in zip(tensors, before, strict=True):
-                tensor.copy_(value)
-
-
 def recorded_block(block: TensorDictModuleBase, data: TensorDictBase) -> Block:
     """``block(data)``, which writes its ``out_keys`` from its ``in_keys``, as one compiled graph.
 
@@ -169,7 +158,7 @@ def recorded_block(block: TensorDictModuleBase, data: TensorDictBase) -> Block:
         graph = record(flat, leaves)
         return graph, versions != [x._version for x in buffers]
 
-    graph, changed = _undone(buffers, recording)
+    graph, changed = undone(buffers, recording)
     if changed or len(graph.graph.nodes) > 300:
         what = "changes a buffer" if changed else f"is {len(graph.graph.nodes)} operations, too many to compile soon"
         raise RuntimeError(f"tracing: {type(block).__name__} {what}")

@@ -1,11 +1,12 @@
-"""Loading a loss's state, of the same shapes only."""
+"""State put back: loaded, of the same shapes only, or undone after a trial."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 
 def load(module: nn.Module, state: dict[str, Any]) -> None:
@@ -19,3 +20,15 @@ def load(module: nn.Module, state: dict[str, Any]) -> None:
         if own[name].shape != state[name].shape:
             raise ValueError(f"{name} is {tuple(state[name].shape)} there and {tuple(own[name].shape)} here")
     module.load_state_dict(state)
+
+
+def undone(tensors: Iterable[Tensor], function: Callable[[], Any]) -> Any:
+    """The function's result; what it did to these tensors and to the random generator is undone."""
+    before = [(tensor, tensor.detach().clone()) for tensor in tensors]
+    try:
+        with torch.random.fork_rng(devices=[]):
+            return function()
+    finally:
+        with torch.no_grad():
+            for tensor, value in before:
+                tensor.copy_(value)

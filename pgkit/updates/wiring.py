@@ -14,6 +14,7 @@ from torch.optim import Optimizer
 from pgkit.errors import UserError
 from pgkit.updates import entries, owners
 from pgkit.updates.chain import Chain, is_loss
+from pgkit.updates.restoring import undone
 
 
 def read_keys(loss: nn.Module, data: TensorDictBase) -> list[Any]:
@@ -55,18 +56,17 @@ def check(
     """
     chain = Chain(loss, advantage, source)
     owners.check_settings(chain, dict(settings or {}))
-    buffers = [(x, x.clone()) for x in loss.buffers()]
     entries.check_form(chain, batch)
-    with torch.random.fork_rng(devices=[]):
-        out = _run(chain, batch)
-        _check_result(chain, batch, out)
-        reason = entries.wrong_action(chain, batch)
-    if reason:
+    return undone(loss.buffers(), lambda: _trial(chain, optimizer, batch))  # a forward pass may update statistics
+
+
+def _trial(chain: Chain, optimizer: Optimizer, batch: TensorDictBase) -> list[str]:
+    out = _run(chain, batch)
+    _check_result(chain, batch, out)
+    if reason := entries.wrong_action(chain, batch):
         raise UserError(reason)
     total = torch.stack([out[key].sum() for key in out.keys() if is_loss(key)]).sum()
     owners.check_parameters(chain, optimizer, total)
-    for x, before in buffers:  # statistics that a forward pass updates
-        x.copy_(before)
     return [key for key in out.keys() if out[key].numel() == 1]
 
 

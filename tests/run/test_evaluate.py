@@ -31,6 +31,14 @@ def test_every_slot_plays_its_own_share(kit: SimpleNamespace):
     assert returns.tolist() == [1, 2, 2, 4, 3]
 
 
+def test_an_episode_that_goes_on_and_on_is_said(kit: SimpleNamespace, monkeypatch, caplog):
+    monkeypatch.setitem(run.play.__globals__, "LONG_EPISODE", 2)
+    run.play(kit.policy(), kit.Env(num_envs=2, seed=1), episodes=2)  # of one and two steps
+    assert not caplog.text
+    run.play(kit.policy(), kit.Env(num_envs=3, seed=1), episodes=3)
+    assert "has come to 2 steps and goes on" in caplog.text
+
+
 def test_scores_are_mean_and_population_deviation(kit: SimpleNamespace):
     scores = run.evaluate(kit.policy(), kit.Env(num_envs=2, seed=1), episodes=2)
     # returns 1 and 2
