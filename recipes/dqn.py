@@ -88,7 +88,7 @@ def main(args: Args) -> None:
             env,
             args.buffer_size,
             n_steps=args.n_step,
-            sampler=data.Prioritized() if args.replay == "prioritized" else None,
+            sampler=data.Prioritized(alpha=0.3) if args.replay == "prioritized" else None,  # of squared errors: |.|^0.6
         )
         update = updates.OffPolicyUpdate(
             loss=loss,

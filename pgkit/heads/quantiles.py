@@ -39,7 +39,9 @@ class Quantiles:
         return out.mean(-1)
 
     def pool(self, out: Tensor) -> tuple[Tensor, Tensor]:
-        """All critics' atoms, sorted, without the ``drop * critics`` largest."""
+        """All critics' atoms, sorted, without the ``drop * critics`` largest; a ``UserError`` if none is left."""
+        if self.drop >= out.shape[-1]:
+            raise UserError(f"drop={self.drop} of {out.shape[-1]} quantiles of each critic: it must leave at least one")
         atoms = out.flatten(-2).sort(-1).values
         atoms = atoms[..., : atoms.shape[-1] - self.drop * out.shape[-2]]
         return atoms, torch.full_like(atoms, 1 / atoms.shape[-1])

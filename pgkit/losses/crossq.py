@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, dispatch
+from torch import nn
 
 from pgkit.functional import same_shape, soft_returns
 from pgkit.losses.soft_base import SoftQLoss
@@ -24,8 +26,8 @@ class CrossQLoss(SoftQLoss):
         L_Q &= \frac1B \sum \sum_i (Q_i(s, a) - y)^2 \\
         L_\pi &= \frac1B \sum \alpha \log \pi(\tilde a|s) - \min_i Q_i(s, \tilde a)
 
-    The critics want batch normalization: ``modules.q_value(env, body=modules.batch_renorm_mlp)``. In
-    :math:`L_\pi` it uses its running statistics.
+    The critics want batch normalization: ``modules.q_value(env, body=modules.batch_renorm_mlp)``, or torch's or
+    TorchRL's layers. In :math:`L_\pi` it uses its running statistics.
 
     A drop-in for TorchRL's loss of that name; there the distance is ``smooth_l1``.
 
@@ -66,6 +68,20 @@ class CrossQLoss(SoftQLoss):
         self.write_priority(batch, q - (atoms * weights).sum(-1, keepdim=True))
 
         action, log_prob = self.act(batch, self.actor_network_params)
-        value = self.actor_value(self.q(batch, action, self.qvalue_network_params.detach()))
+        with _running_statistics(self.qvalue_network):
+            value = self.actor_value(self.q(batch, action, self.qvalue_network_params.detach()))
         same_shape(log_prob=log_prob, value=value)
         return self.result(batch, alpha * log_prob - value, qvalue_loss, action, log_prob, q)
+
+
+@contextmanager
+def _running_statistics(network: nn.Module) -> Iterator[None]:
+    """Normalization layers that go by a mode (torch's, TorchRL's) use their running statistics and leave them."""
+    switched = [module for module in network.modules() if module.training and hasattr(module, "running_mean")]
+    for module in switched:
+        module.training = False
+    try:
+        yield
+    finally:
+        for module in switched:
+            module.training = True

@@ -56,7 +56,8 @@ class DDPGLoss(QLoss):
         head: Head | None = None,
     ) -> None:
         refuse_stochastic("DDPGLoss", actor_network)
-        critics = getattr(value_network, "num_critics", 1)
+        several = len(value_network) if isinstance(value_network, list | tuple) else 1
+        critics = getattr(value_network, "num_critics", several)
         if critics != 1:
             raise UserError(f"DDPGLoss has one critic, these are {critics}: num_critics=1, or losses.TD3Loss for two")
         super().__init__(

@@ -129,21 +129,28 @@ class QLoss(Loss):
         """What the head reads, ``[*B, critics, size]``, for ``action`` at the batch's observations.
 
         ``members`` names the critics to evaluate, in the order of the result; None: all.
+
+        Raises:
+            UserError: the critics' outputs are not those of this number of critics or not those of the head.
         """
         data = batch.select(*self.qvalue_network.in_keys, strict=False).set(self.tensor_keys.action, action)
+        number = self.num_critics if members is None else None
         params, members = self.params_of(params, members)
         if self._each is not None:
             out = self._each(data, params).get(self.tensor_keys.state_action_value)
-            return (out if out.dim() == data.dim() + 2 else out.squeeze(-2)).movedim(0, -2)
-        with params.to_module(self.qvalue_network, preserve_module_state=False):
-            out = self.qvalue_network(data).get(self.tensor_keys.state_action_value)
-        if out.dim() == data.dim() + 1:  # [*B, critics], or what a single critic with a head writes
-            if self.num_critics > 1 and self.head.size > 1:
-                raise UserError(
-                    f"{self.head} needs {self.head.size} outputs of each of the {self.num_critics} critics, there are "
-                    f"{tuple(out.shape)}: give the critics the head (modules.q_value(env, head=...))"
-                )
-            out = out.unsqueeze(-1 if self.head.size == 1 else -2)
+            out = (out if out.dim() == data.dim() + 2 else out.squeeze(-2)).movedim(0, -2)
+        else:
+            with params.to_module(self.qvalue_network, preserve_module_state=False):
+                out = self.qvalue_network(data).get(self.tensor_keys.state_action_value)
+            if out.dim() == data.dim() + 1:  # [*B, critics], or what a single critic with a head writes
+                out = out.unsqueeze(-2 if self.head.size > 1 and self.num_critics == 1 else -1)
+        if (out.shape[-1] > 1) != (self.head.size > 1) or out.shape[-2] != (number or out.shape[-2]):
+            outputs = "one output" if self.head.size == 1 else f"{self.head.size} outputs"
+            raise UserError(
+                f"{self.head} needs {outputs} of each of the {self.num_critics} critics, there are "
+                f"{out.shape[-1]} of {out.shape[-2]}: give the critics the head (modules.q_value(env, "
+                f"{self.num_critics}, head=...))"
+            )
         return out if members is None else out[..., members, :]
 
     def params_of(self, params: Any, members: Tensor | slice | None) -> tuple[Any, Tensor | slice | None]:

@@ -157,7 +157,14 @@ def _check_actions(loss: str, actor: TensorDictModule, discrete: bool) -> None:
         )
     for module in actor.modules():
         kind = getattr(module, "distribution_class", None)
-        if kind is None or discrete == (not getattr(kind, "has_rsample", True)):
+        if kind is None:
+            continue
+        if discrete and not getattr(kind, "has_rsample", True) and not hasattr(kind, "logits"):
+            raise UserError(
+                f"{loss} takes one discrete action, this actor draws {kind.__name__} ones: losses.ClipPPOLoss and "
+                "losses.A2CLoss take it"
+            )
+        if discrete == (not getattr(kind, "has_rsample", True)):
             continue
         if discrete:
             raise UserError(

@@ -85,6 +85,8 @@ class MaskedHead(nn.Module):
 class MultiCategorical(distributions.Independent):
     """Independent choices: ``logits [*B, sum(choices)]``, actions ``[*B, len(choices)]``, log-probability ``[*B]``."""
 
+    has_rsample = False  # said by the class, as those of single choices do
+
     def __init__(self, logits: Tensor, choices: Sequence[int]) -> None:
         least, most = torch.finfo(logits.dtype).min, max(choices)
         parts = [F.pad(x, (0, most - x.shape[-1]), value=least) for x in logits.split(list(choices), -1)]

@@ -72,7 +72,7 @@ def parameters(optimizer: Optimizer) -> list[Tensor]:
 def functional(optimizer: Any, fused: bool, params: list[Tensor] | None = None) -> Functional | None:
     """``(apply, read_learning_rates, rates)`` for Adam, AdamW, SGD and RMSprop, and for several of these ``Together``.
 
-    None for any other optimizer.
+    None for any other optimizer, and for SGD with dampening.
 
     ``apply(grads)`` takes one gradient a parameter, in the order of :func:`parameters`, and can be traced.
     ``read_learning_rates()`` copies the groups' ``lr`` into the tensors ``rates`` that the trace uses: annealing an
@@ -86,7 +86,8 @@ def functional(optimizer: Any, fused: bool, params: list[Tensor] | None = None) 
     if isinstance(optimizer, Together):
         return _together(optimizer, fused, parameters(optimizer) if params is None else params)
     make = {Adam: _adam, AdamW: _adam, SGD: _sgd, RMSprop: _rmsprop}.get(type(optimizer))
-    if make is None or any(group.get("capturable") or group.get("differentiable") for group in optimizer.param_groups):
+    unusual = ("capturable", "differentiable", "dampening")  # dampening leaves out the first step
+    if make is None or any(group.get(name) for group in optimizer.param_groups for name in unusual):
         return None
     kept = {id(p) for p in (parameters(optimizer) if params is None else params)}
     groups = [{**g, "params": [p for p in g["params"] if id(p) in kept]} for g in optimizer.param_groups]
@@ -190,7 +191,7 @@ def _sgd(optimizer: Optimizer, group: dict[str, Any], lr: Tensor, fused: bool) -
         sgd(
             params, grads, buffers[0] if buffers else [None] * len(grads),
             foreach=False, fused=False, weight_decay=weight_decay, momentum=group["momentum"], lr=lr,
-            dampening=group["dampening"], nesterov=group["nesterov"], maximize=maximize,
+            dampening=0.0, nesterov=group["nesterov"], maximize=maximize,
         )  # fmt: skip
 
     return _at_a_tensor_s_rate(step, group, lr)

@@ -4,6 +4,7 @@ from functools import partial
 
 import pytest
 import torch
+from torchrl.modules import MLP, BatchRenorm1d, ValueOperator
 from torchrl.objectives import CrossQLoss as TorchRLCrossQLoss
 
 from pgkit import controllers, envs, losses, modules, updates
@@ -100,3 +101,25 @@ def test_batch_statistics_are_used_in_a_list_of_critics_as_in_an_ensemble():
     torch.testing.assert_close(*results)
     for loss in (several, together):
         assert all((x == 1).all() for key, x in loss.qvalue_network_params.items(True, True) if key[-1] == "steps")
+
+
+@pytest.mark.parametrize("norm", [torch.nn.BatchNorm1d, partial(BatchRenorm1d, warmup_steps=0)])
+def test_critics_whose_normalization_goes_by_a_mode_are_normalized_as_in_torchrl(norm):
+    env, data, results = envs.make("Pendulum-v1"), batch(), []
+    for name in ("mine", "theirs"):
+        torch.manual_seed(0)
+        actor = modules.tanh_normal_actor(env, (8,))
+        nets = [MLP(4, 1, num_cells=[8], norm_class=norm, norm_kwargs={"num_features": 8}) for _ in range(2)]
+        critics = [ValueOperator(net, in_keys=["observation", "action"]) for net in nets]
+        if name == "mine":
+            loss = losses.CrossQLoss(actor, critics)
+        else:
+            loss = TorchRLCrossQLoss(actor, critics, loss_function="l2", action_spec=env.action_spec_unbatched)
+            loss.make_value_estimator(gamma=0.99)
+        for _ in range(2):  # from the second on, the running statistics are not the first ones
+            torch.manual_seed(1)
+            out = loss(data.clone())
+        statistics = {key: x for key, x in loss.qvalue_network_params.items(True, True) if "running" in str(key)}
+        results.append(({key: out[key] for key in ("loss_actor", "loss_qvalue")}, statistics))
+        assert loss.qvalue_network.training and statistics
+    torch.testing.assert_close(*results)

@@ -8,7 +8,7 @@ from torch import nn
 from torchrl.objectives import DDPGLoss as TorchRLDDPGLoss
 from torchrl.objectives import SoftUpdate
 
-from pgkit import collectors, data, envs, losses, modules, updates
+from pgkit import collectors, data, envs, heads, losses, modules, updates
 from pgkit.errors import UserError
 
 
@@ -160,3 +160,17 @@ def test_refusals():
         losses.DDPGLoss(modules.gaussian_actor(env), modules.q_value(env, 1))
     with pytest.raises(UserError, match="one critic, these are 2.*TD3Loss"):
         losses.DDPGLoss(modules.deterministic_actor(env), modules.q_value(env))
+    with pytest.raises(UserError, match="one critic, these are 2.*TD3Loss"):
+        losses.DDPGLoss(modules.deterministic_actor(env), [modules.q_value(env, 1), modules.q_value(env, 1)])
+
+
+@pytest.mark.parametrize("outputs", [1, 5])
+def test_outputs_that_are_not_the_head_s_are_refused(outputs):
+    # 1 output would be trained as the median alone, 5 without a head as 5 critics
+    actor = TensorDictModule(nn.Linear(17, 6), ["observation"], ["action"])
+    critic = TensorDictModule(nn.Bilinear(17, 6, outputs), ["observation", "action"], ["state_action_value"])
+    head = heads.Quantiles(25, drop=0) if outputs == 1 else None
+    loss = losses.DDPGLoss(actor, critic, head=head)
+    SoftUpdate(loss, tau=0.1)
+    with pytest.raises(UserError, match="needs (25 outputs|one output) of each of the 1 critics, there are 1 of"):
+        loss(batch(dtype=torch.float32))

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from gymnasium import spaces
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
@@ -261,6 +262,15 @@ def test_refusals():
         losses.DiscreteSACLoss(modules.categorical_actor(env), modules.discrete_q_value(env), form="sampled")
     with pytest.raises(UserError, match="discrete_q_value needs one discrete action.*modules.q_value"):
         modules.discrete_q_value(envs.make("Pendulum-v1"))
+
+
+def test_several_discrete_actions_at_once_are_refused():
+    env = envs.make(lambda: Masked(spaces.MultiDiscrete([2, 2])), flatten=False)
+    actor = modules.categorical_actor(env)
+    with pytest.raises(UserError, match="takes one discrete action, this actor draws MultiCategorical ones.*ClipPPO"):
+        losses.DiscreteSACLoss(actor, modules.discrete_q_value(envs.make("CartPole-v1")))
+    with pytest.raises(UserError, match="SACLoss needs an actor over continuous actions, this one is MultiCategorical"):
+        losses.SACLoss(actor, modules.q_value(envs.make("Pendulum-v1")))
 
 
 def test_the_target_entropy_comes_from_the_number_of_actions():

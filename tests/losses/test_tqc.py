@@ -7,6 +7,7 @@ from torchrl.objectives import SoftUpdate
 from torchrl.objectives import TQCLoss as TorchRLTQCLoss
 
 from pgkit import controllers, envs, heads, losses, modules
+from pgkit.errors import UserError
 from tests.losses.test_redq import assert_each_term_trains_its_own, constant_noise, gradients, shake_targets
 from tests.losses.test_sac import batch
 
@@ -75,3 +76,12 @@ def test_gradients_reach_the_right_parameters():
     loss = losses.TQCLoss(modules.tanh_normal_actor(env, (8,)), critics)
     SoftUpdate(loss, tau=0.1)
     assert_each_term_trains_its_own(loss, loss(batch()))
+
+
+def test_a_pool_that_would_be_empty_is_refused():
+    env = envs.make("Pendulum-v1")
+    critics = modules.q_value(env, 2, (8,), head=heads.Quantiles(10))
+    loss = losses.TQCLoss(modules.tanh_normal_actor(env, (8,)), critics, head=heads.Quantiles(25, drop=10))
+    SoftUpdate(loss, tau=0.1)
+    with pytest.raises(UserError, match="drop=10 of 10 quantiles of each critic: it must leave at least one"):
+        loss(batch())

@@ -174,6 +174,7 @@ def test_two_compiled_agents_in_one_process_do_not_mix():
         torch.optim.Adam,
         lambda p, lr: torch.optim.AdamW(p, lr=lr, weight_decay=0.1, amsgrad=True),
         lambda p, lr: torch.optim.SGD(p, lr=lr, momentum=0.9, nesterov=True),
+        lambda p, lr: torch.optim.SGD(p, lr=lr, momentum=0.9, dampening=0.5),  # outside too
         lambda p, lr: torch.optim.RMSprop(p, lr=lr, momentum=0.5, centered=True),
         torch.optim.Adagrad,  # has no functional form here: steps outside the graph
         lambda p, lr: torch.optim.Adam([{"params": p[:3], "lr": 1e-2}, {"params": p[3:]}], lr=lr),
