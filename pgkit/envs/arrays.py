@@ -9,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from pgkit.envs.checks import check_step, checked_reset
 from pgkit.errors import UserError
 
 _ARRAYS = (spaces.Box, spaces.MultiBinary)  # whose observations are arrays
@@ -45,6 +46,8 @@ class ArrayEnv:
 
     def __init__(self, make_env: Callable[[], gym.Env], num_envs: int, seed: int = 0, first: int = 0) -> None:
         self.envs = [make_env() for _ in range(num_envs)]
+        if len({id(env.unwrapped) for env in self.envs}) < num_envs:
+            raise UserError("the function that makes an environment gave the same one twice: it must make a new one")
         self.num_envs, self.first = num_envs, first
         self._write, shape = _observation_writer(self.envs[0].observation_space)
         self._to_env = _action_converter(self.envs[0].action_space)
@@ -54,6 +57,7 @@ class ArrayEnv:
         self._terminated = np.zeros(num_envs, bool)
         self._truncated = np.zeros(num_envs, bool)
         self.memory: np.ndarray | None = None
+        self._stepped = False
         self.restart(seed)
 
     def restart(self, seed: int) -> None:
@@ -68,7 +72,8 @@ class ArrayEnv:
     def _begin(self, i: int) -> None:
         self._episode[i] += 1
         seed = episode_seed(self.seed, self.first + i, int(self._episode[i]))
-        self._write(self.obs[i], self.envs[i].reset(seed=seed)[0])
+        result = self.envs[i].reset(seed=seed) if self._episode[i] else checked_reset(self.envs[i], seed)
+        self._write(self.obs[i], result[0])
         self.fresh[i] = True
         self._history[i] = []
 
@@ -91,10 +96,14 @@ class ArrayEnv:
             self.fresh[:] = False
         actions = self._to_env(actions)
         for i, env in enumerate(self.envs):
-            obs, reward, terminated, truncated, _ = env.step(actions[i])
+            result = env.step(actions[i])
+            if not self._stepped:
+                check_step(env, result)
+            obs, reward, terminated, truncated, _ = result
             self._write(self._next_obs[i], obs)
             self._reward[i], self._terminated[i], self._truncated[i] = reward, terminated, truncated
             self._history[i].append(actions[i])
+        self._stepped = True
         self.episode_reward += self._reward
         self.step_count += 1
         self.obs[:] = self._next_obs

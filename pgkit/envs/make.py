@@ -10,6 +10,7 @@ from functools import partial
 from typing import Any
 
 import gymnasium as gym
+from torchrl.envs import EnvBase
 
 from pgkit.envs.action_repeat import ActionRepeat
 from pgkit.envs.vector import VectorEnv
@@ -24,31 +25,44 @@ def make(
     workers: int = 1,
     action_repeat: int = 1,
     flatten: bool = True,
+    max_episode_steps: int | None = None,
     **kwargs: Any,
 ) -> VectorEnv:
     """Makes a vector of environments.
 
     Args:
-        env_id: a Gymnasium id, ``dm_control/<domain>-<task>-v0`` (also ``dmc:<domain>-<task>``), or a function
-            that makes one environment.
+        env_id: a Gymnasium id, ``dm_control/<domain>-<task>-v0`` (also ``dmc:<domain>-<task>``), or a function or
+            class that makes one environment, a new one at every call.
         num_envs: number of environments.
         seed: seed of the whole vector; environment ``i`` gets its own stream.
         workers: processes that share the environments when a :class:`~pgkit.collectors.VectorCollector` collects.
         action_repeat: steps of the simulator for each action; a frame is then one decision, its reward their sum.
         flatten: a Dict observation becomes one vector, ``observation``; False keeps its entries apart, each under its
             own name: for one encoder per entry (:func:`pgkit.modules.dict_encoder`) and for action masks.
-        **kwargs: passed to ``gymnasium.make``, or to the dm_control task.
+        max_episode_steps: time limit; None: the id's own, which a function or class has none of.
+        **kwargs: passed to ``gymnasium.make``, to the dm_control task, or to the function or class.
 
     Raises:
         UserError: the id is unknown (the message has the nearest names), a package is missing (it has the
-            install line), there are more workers than environments, or there is no Dict to keep apart.
+            install line), there are more workers than environments, there is no Dict to keep apart, or ``env_id`` is an
+            environment.
     """
+    if not (isinstance(env_id, str) or callable(env_id)) or isinstance(env_id, gym.Env | EnvBase):
+        raise UserError(
+            f"envs.make takes an id, or a function or class that makes one environment, this is a "
+            f"{type(env_id).__name__}: envs.make(lambda: ...)"
+        )
     if num_envs < 1 or workers < 1 or workers > num_envs:
         raise UserError(
             f"num_envs={num_envs}, workers={workers}: every worker needs at least one environment; "
             "choose 1 <= workers <= num_envs"
         )
-    make_env = partial(make_one, env_id, **kwargs) if isinstance(env_id, str) else env_id
+    if isinstance(env_id, str) and not env_id.startswith(("dm_control/", "dmc:")):
+        make_env = partial(make_one, env_id, max_episode_steps=max_episode_steps, **kwargs)
+    else:
+        make_env = partial(*((make_one, env_id) if isinstance(env_id, str) else (env_id,)), **kwargs)
+        if max_episode_steps is not None:
+            make_env = partial(_limit, make_env, max_episode_steps)
     if action_repeat > 1:
         make_env = partial(_repeat, make_env, action_repeat)
     env = VectorEnv(make_env, num_envs, seed, workers, flatten)
@@ -56,6 +70,10 @@ def make(
     if action_repeat > 1:
         env.env_id += f" (action repeat {action_repeat})"
     return env
+
+
+def _limit(make_env: Callable[[], gym.Env], steps: int) -> gym.Env:
+    return gym.wrappers.TimeLimit(make_env(), steps)
 
 
 def _repeat(make_env: Callable[[], gym.Env], times: int) -> gym.Env:
@@ -84,6 +102,10 @@ def make_one(env_id: str, **kwargs: Any) -> gym.Env:
         raise _not_installed(env_id, error) from error
     except gym.error.Error as error:
         raise UserError(f"environment '{env_id}': {str(error).splitlines()[0]}") from error
+    except TypeError as error:
+        if not kwargs or "argument" not in str(error):
+            raise
+        raise UserError(f"environment '{env_id}' cannot be made with these settings: {error}") from error
 
 
 def _not_installed(env_id: str, error: Exception) -> UserError:

@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from pgkit.errors import UserError
+from pgkit.errors import UserError, whole
 from pgkit.run.seeding import preserved_rng
 
 Entries = Mapping[str, torch.Tensor]
@@ -79,6 +79,7 @@ def play(policy: torch.nn.Module, env: Any, episodes: int) -> tuple[np.ndarray, 
         policy: a TensorDict actor that reads ``observation`` and writes ``action``.
         env: has ``.arrays``: ``reset()``, ``step(action)``, ``obs``, ``episode_reward``, ``step_count``.
     """
+    whole(1, episodes=episodes)
     if isinstance(env, TransformedEnv) or not hasattr(env, "arrays"):  # the former's arrays know no transforms
         raise UserError(
             f"evaluation plays what envs.make gives, a {type(env).__name__} is none of that: "

@@ -8,7 +8,10 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
+import numpy as np
 from tensordict import TensorDictBase
+
+from pgkit.errors import UserError
 
 
 def read_csv(path: Path) -> tuple[list[str], list[dict[str, str]]]:
@@ -84,7 +87,14 @@ def finished_episodes(rollout: TensorDictBase | None) -> list[tuple[float, int]]
 def averages(rows: Sequence[Mapping[str, float]]) -> dict[str, float]:
     """The mean of every name over the rows that have it."""
     names = dict.fromkeys(name for row in rows for name in row)
-    return {name: fmean(float(row[name]) for row in rows if name in row) for name in names}
+    return {name: fmean(_number(name, row[name]) for row in rows if name in row) for name in names}
+
+
+def _number(name: str, value: Any) -> float:
+    try:
+        return float(value)
+    except (TypeError, ValueError, RuntimeError):
+        raise UserError(f"the metric '{name}' is a {type(value).__name__} {np.shape(value)}: log one number") from None
 
 
 def warm(fps: list[float]) -> list[float]:

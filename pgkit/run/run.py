@@ -13,6 +13,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from torchrl.envs import EnvBase
 
 from pgkit.errors import UserError
 from pgkit.run import checkpoint, directory, seeding
@@ -31,7 +32,8 @@ class Run:
     """Seeds on entry, writes the run directory, ends with an evaluation, a summary and a curve.
 
     Nothing is written before :meth:`track`, so a bad setting leaves no directory behind. Ctrl-C lets the
-    running update finish, saves ``latest`` and ends the run; a second Ctrl-C ends it at once.
+    running update finish, saves ``latest`` and ends the run; a second Ctrl-C ends it at once. One during an evaluation
+    ends that, and a failed evaluation ends the run: both after ``latest`` is saved.
 
     Raises:
         UserError: the directory holds a run; or the resumed one has no checkpoint, is another recipe's, or
@@ -52,7 +54,7 @@ class Run:
         self._clock = Clock(already=counters.get("wall_s", 0.0))
         self._tracked: dict[str, checkpoint.Stateful] = {}
         self._eval: Any = None
-        self._interrupted = self._diverged = False
+        self._interrupted = self._diverged = self._evaluating = False
 
     def _load(self) -> dict[str, Any]:
         config = directory.read_config(self.dir)
@@ -82,6 +84,11 @@ class Run:
             eval_env: picklable; ``eval_env(num_envs=, seed=)`` makes the evaluation's own env.
             stateful: whatever else the run must restore (update, collector, normalizer, ...).
         """
+        if not callable(eval_env) or isinstance(eval_env, EnvBase):
+            raise UserError(
+                f"track(eval_env=...) takes a function that makes an environment, this is a {type(eval_env).__name__}: "
+                "functools.partial(envs.make, env_id)"
+            )
         tracked: dict[str, checkpoint.Stateful] = {"policy": policy, **stateful}
         if self.args.explain:
             print(stateful.get("update", policy))
@@ -136,7 +143,12 @@ class Run:
         self._warn_of_divergence(row)
         self._live.update(frames, row["rollout/ep_rew_mean"], row["time/fps"])
         if due:
-            row |= self._evaluate(row)
+            try:
+                row |= self._evaluate(row)
+            except BaseException:  # also a second Ctrl-C: what was trained is kept
+                self._metrics.write(row)
+                self.save()
+                raise
         self._metrics.write(row)
         if due or self._interrupted:
             self.save()
@@ -165,7 +177,11 @@ class Run:
         with self._clock.paused(), seeding.preserved_rng():
             env = self._eval_env()
             env.set_seed(seeding.evaluation_seed(self.args.seed, self.frames))
-            scores = evaluate(self._policy, env, self.args.eval_episodes)
+            self._evaluating = True
+            try:
+                scores = evaluate(self._policy, env, self.args.eval_episodes)
+            finally:
+                self._evaluating = False
             self._evaluated = {"frames": self.frames, **scores}
             if scores["eval/mean_reward"] > self.best.get("eval/mean_reward", -float("inf")):
                 self.best = self._evaluated
@@ -213,7 +229,7 @@ class Run:
             self._say_how_to_go_on()
 
     def _interrupt(self, number: int, frame: FrameType | None) -> None:
-        if self._interrupted or not self._tracked:
+        if self._interrupted or self._evaluating or not self._tracked:
             raise KeyboardInterrupt
         self._interrupted = True
         self._live.line("stopping after this update; press Ctrl-C again to stop at once")

@@ -1,3 +1,5 @@
+from typing import Any
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -158,3 +160,75 @@ def test_missing_package_names_the_install_line(monkeypatch):
 def test_more_workers_than_envs():
     with pytest.raises(UserError, match="every worker needs at least one environment"):
         envs.make("CartPole-v1", num_envs=2, workers=3)
+
+
+class Own(gym.Env):
+    """Three numbers; what ``reset`` and ``step`` return can be made wrong."""
+
+    def __init__(self, level: int = 1, obs: Any = (1, 2, 3), end: bool = False, wrong: str = "") -> None:
+        self.level, self.obs, self.end, self.wrong = level, np.array(obs, np.float32), end, wrong
+        self.observation_space, self.action_space = gym.spaces.Box(-9, 9, (3,)), gym.spaces.Box(-1, 1, (1,))
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        return self.obs * self.level if self.wrong == "reset" else (self.obs * self.level, {})
+
+    def step(self, action: Any) -> Any:
+        obs = self.obs[:1] if self.wrong == "obs" else self.obs
+        reward = np.ones(3) if self.wrong == "reward" else 1.0
+        return (obs, reward, False, {}) if self.wrong == "step" else (obs, reward, self.end, False, {})
+
+
+def test_keywords_and_a_time_limit_reach_a_class():
+    env = envs.make(Own, num_envs=2, level=2, max_episode_steps=3)
+    assert env.reset()["observation"].tolist() == [[2, 4, 6]] * 2
+    rollout = env.rollout(7, break_when_any_done=False, auto_reset=True)
+    assert rollout["next", "truncated"].squeeze(-1).tolist() == [[False, False, True, False, False, True, False]] * 2
+    assert (
+        envs.make("dm_control/cartpole-swingup-v0", max_episode_steps=4).rollout(9)["next", "truncated"].shape[1] == 4
+    )
+    with pytest.raises(TypeError, match="typo"):
+        envs.make(Own, typo=3)
+    with pytest.raises(UserError, match="'Pendulum-v1' cannot be made with these settings: .*'gravty'"):
+        envs.make("Pendulum-v1", gravty=9)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ("reset", r"Own.reset returned a ndarray: return the tuple \(observation, info\)"),
+        ("step", "Own.step returned a tuple of 4: return the tuple .*truncated, info"),
+        ("obs", r"Own.step returned observation of shape \(1,\), its space says \(3,\)"),
+        ("reward", r"Own.step returned a reward of shape \(3,\): return one number"),
+    ],
+)
+def test_what_an_environment_of_ones_own_returns_is_checked_once(wrong, message):
+    with pytest.raises(UserError, match=message):
+        envs.make(Own, num_envs=2, wrong=wrong).rollout(2)
+
+
+def test_former_gym_s_reset_and_missing_entries_are_named():
+    class Former(Own):
+        def reset(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
+            return self.obs
+
+    class Lacking(Own):
+        def __init__(self) -> None:
+            super().__init__()
+            self.observation_space = gym.spaces.Dict(a=gym.spaces.Box(-9, 9, (3,)), b=gym.spaces.Box(-9, 9, (3,)))
+
+        def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+            return {"a": self.obs}, {}
+
+    with pytest.raises(UserError, match="Former.reset takes no seed: write reset"):
+        envs.make(Former).reset()
+    with pytest.raises(UserError, match=r"Lacking.reset returned no observation\['b'\]"):
+        envs.make(Lacking).reset()
+
+
+def test_an_environment_is_no_maker_of_environments():
+    one = gym.make("Pendulum-v1")
+    for env in (one, envs.make("Pendulum-v1"), None):
+        with pytest.raises(UserError, match=f"takes an id, or a function or class .* this is a {type(env).__name__}"):
+            envs.make(env)
+    with pytest.raises(UserError, match="gave the same one twice"):
+        envs.make(lambda: one, num_envs=2).reset()

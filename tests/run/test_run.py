@@ -6,11 +6,14 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
+from pgkit import envs, run
 from pgkit.errors import UserError
 from pgkit.run import RunArgs
+from pgkit.run.metrics import averages
 
 Row = dict[str, str]
 
@@ -124,6 +127,35 @@ def test_ctrl_c_finishes_the_step_saves_and_can_be_resumed(kit: SimpleNamespace,
     assert signal.getsignal(signal.SIGINT) is handler
     kit.train(arguments(tmp_path / "r", resume=tmp_path / "r"))
     assert rows(tmp_path / "r") == rows(tmp_path / "whole")
+
+
+def test_a_failed_or_stopped_evaluation_costs_no_training(kit: SimpleNamespace, tmp_path: Path, monkeypatch: Any):
+    def stop(*_: Any) -> Any:
+        os.kill(os.getpid(), signal.SIGINT)  # once: an evaluation ends at the first Ctrl-C
+        pytest.fail("went on")
+
+    for place, error, fail in (("a", KeyboardInterrupt, stop), ("b", ZeroDivisionError, lambda *_: 1 / 0)):
+        with monkeypatch.context() as patch:
+            patch.setattr("pgkit.run.run.evaluate", fail)
+            with pytest.raises(error):
+                kit.train(arguments(tmp_path / place))
+        assert (tmp_path / place / "checkpoints" / "latest.pt").exists()
+        assert len(rows(tmp_path / place)) == 2
+        kit.train(arguments(tmp_path / place, resume=tmp_path / place))
+        assert len(rows(tmp_path / place)) == 4
+
+
+def test_an_environment_is_no_function_that_makes_one(kit: SimpleNamespace, tmp_path: Path):
+    with (
+        pytest.raises(UserError, match="takes a function that makes an environment, this is a VectorEnv"),
+        run.Run(arguments(tmp_path / "r"), "toy") as log,
+    ):
+        log.track(policy=kit.policy(), eval_env=envs.make("Pendulum-v1"))
+
+
+def test_a_metric_that_is_no_number_is_named(kit: SimpleNamespace):
+    with pytest.raises(UserError, match=r"the metric 'my/x' is a ndarray \(2,\): log one number"):
+        averages([{"my/x": np.ones(2)}])
 
 
 def test_a_directory_with_a_run_is_refused_and_stays_as_it_is(kit: SimpleNamespace, tmp_path: Path):

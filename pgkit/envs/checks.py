@@ -1,0 +1,65 @@
+"""What an environment's first reset and first step return, against Gymnasium's interface and its own spaces."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+from pgkit.errors import UserError
+
+
+def checked_reset(env: gym.Env, seed: int) -> tuple[Any, dict[str, Any]]:
+    """``env.reset(seed=seed)``; a ``UserError`` where it is not as Gymnasium asks."""
+    try:
+        result: Any = env.reset(seed=seed)
+    except TypeError as error:
+        if "seed" not in str(error):
+            raise
+        raise UserError(
+            f"{_name(env)}.reset takes no seed: write reset(self, *, seed=None, options=None) and "
+            "super().reset(seed=seed)"
+        ) from error
+    if not (isinstance(result, tuple) and len(result) == 2 and isinstance(result[1], dict)):
+        raise UserError(f"{_name(env)}.reset returned {_kind(result)}: return the tuple (observation, info)")
+    _check_observation(env, "reset", result[0])
+    return result
+
+
+def check_step(env: gym.Env, result: Any) -> None:
+    """A ``UserError`` where what ``env.step`` returned is not as Gymnasium asks."""
+    if not (isinstance(result, tuple) and len(result) == 5):
+        raise UserError(
+            f"{_name(env)}.step returned {_kind(result)}: return the tuple (observation, reward, terminated, "
+            "truncated, info)"
+        )
+    _check_observation(env, "step", result[0])
+    if np.size(result[1]) != 1:
+        raise UserError(f"{_name(env)}.step returned a reward of shape {np.shape(result[1])}: return one number")
+
+
+def _check_observation(env: gym.Env, method: str, obs: Any) -> None:
+    space = env.observation_space
+    if isinstance(space, spaces.Dict):
+        parts = [(f"observation['{key}']", part, key) for key, part in space.spaces.items()]
+        missing = [key for _, _, key in parts if not (isinstance(obs, dict) and key in obs)]
+        if missing:
+            raise UserError(f"{_name(env)}.{method} returned no observation['{missing[0]}'], which its space has")
+    else:
+        parts = [("observation", space, None)]
+    for name, part, key in parts:
+        found = np.shape(obs if key is None else obs[key])
+        if isinstance(part, spaces.Box) and found != part.shape:
+            raise UserError(
+                f"{_name(env)}.{method} returned {name} of shape {found}, its space says {part.shape}: make them agree"
+            )
+
+
+def _name(env: gym.Env) -> str:
+    return type(env.unwrapped).__name__
+
+
+def _kind(result: Any) -> str:
+    return f"a tuple of {len(result)}" if isinstance(result, tuple) else f"a {type(result).__name__}"
