@@ -15,6 +15,8 @@ from torch.compiler import is_compiling, is_dynamo_compiling
 from torch.fx import GraphModule, Node
 from torch.fx.experimental.proxy_tensor import make_fx
 
+from pgkit.errors import UserError
+
 # the same random numbers as eager code; tensors referred to, never copied into the code as numbers
 _OPTIONS: dict[str, Any] = {
     "fallback_random": True,
@@ -25,6 +27,12 @@ _OPTIONS: dict[str, Any] = {
 _CPU_OPTIONS: dict[str, Any] = {"unroll_reductions_threshold": 1}
 
 
+def check_compile(compile: str) -> None:
+    """A ``UserError`` for anything but ``auto``, ``on`` or ``off``."""
+    if compile not in ("auto", "on", "off"):
+        raise UserError(f"compile is 'auto', 'on' or 'off', not {compile!r}")
+
+
 def worth_compiling(compile: str, calls: float | None, least_calls: float) -> bool:
     """Whether to compile, by the user's choice ``auto``, ``on`` or ``off``.
 
@@ -33,8 +41,7 @@ def worth_compiling(compile: str, calls: float | None, least_calls: float) -> bo
         calls: expected number of calls; None: not known, and taken to be enough.
         least_calls: number of calls that win the compile time back.
     """
-    if compile not in ("auto", "on", "off"):
-        raise ValueError(f"compile is 'auto', 'on' or 'off', not {compile!r}")
+    check_compile(compile)
     if compile != "auto":
         return compile == "on"
     if shutil.which("g++") is None and shutil.which("clang++") is None:

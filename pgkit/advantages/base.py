@@ -9,6 +9,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor
 
+from pgkit.errors import UserError, within
 from pgkit.functional import standardize
 
 
@@ -41,6 +42,17 @@ class Advantage(TensorDictModuleBase):
         return_scale: Any = None,
     ) -> None:
         super().__init__()
+        within(0, 1, gamma=gamma)
+        if critic is not None and not hasattr(critic, "in_keys"):
+            raise UserError(
+                f"{type(self).__name__} takes a TensorDict module as critic, this is a {type(critic).__name__}"
+            )
+        if critic is not None and "state_value" not in critic.out_keys and len(critic.out_keys) != 1:
+            raise UserError(
+                f"{type(self).__name__} reads 'state_value' of its critic, this network writes "
+                f"{', '.join(map(str, critic.out_keys))}: give modules.state_value(env), or a TensorDictModule with "
+                "out_keys=['state_value']"
+            )
         self.critic, self.standardize, self.return_scale = critic, standardize, return_scale
         self.register_buffer("gamma", torch.tensor(float(gamma)))
         observed = [] if critic is None else critic.in_keys
@@ -71,15 +83,21 @@ class Advantage(TensorDictModuleBase):
         """Values of all observations and of all next ones, both ``[*B, T, 1]``."""
         own = rollout["next", "done"].squeeze(-1).clone()  # steps whose successor is not the next entry
         own[..., -1] = True
+        name = "state_value" if "state_value" in critic.out_keys else critic.out_keys[0]
         if torch.compiler.is_compiling():  # shapes may not depend on the data: the critic reads all next ones
             both = torch.cat([x.select(*critic.in_keys).reshape(-1) for x in (rollout, rollout["next"])])
-            value, after = critic(both)[critic.out_keys[0]].reshape(2, *rollout.batch_size, 1)
+            value, after = critic(both)[name].reshape(2, *rollout.batch_size, 1)
             return value, torch.where(own.unsqueeze(-1), after, torch.cat([value[..., 1:, :], after[..., -1:, :]], -2))
         rows, dims = rollout.numel(), rollout.batch_dims
         both = {
             key: torch.cat([rollout[key].flatten(0, dims - 1), rollout["next"][key][own]]) for key in critic.in_keys
         }
-        values = critic(TensorDict(both))[critic.out_keys[0]]
+        values = critic(TensorDict(both))[name]
+        if values.shape[1:] != (1,):
+            raise UserError(
+                f"the critic's '{name}' is {tuple(values.shape[1:])} for one observation, {type(self).__name__} reads "
+                "one value, (1,)"
+            )
         value = values[:rows].reshape(*rollout.batch_size, 1)
         next_value = torch.cat([value[..., 1:, :], torch.zeros_like(value[..., :1, :])], -2)
         next_value[own] = values[rows:]

@@ -10,6 +10,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor
 
 from pgkit.advantages.base import Advantage, ends
+from pgkit.errors import within
 from pgkit.functional import generalized_advantage
 
 
@@ -39,6 +40,7 @@ class GAE(Advantage):
         return_scale: Any = None,
     ) -> None:
         super().__init__(critic, gamma=gamma, standardize=average_gae, return_scale=return_scale)
+        within(0, 1, lmbda=lmbda)
         self.register_buffer("lmbda", torch.tensor(float(lmbda)))
 
     def estimate(self, value: Tensor, next_value: Tensor, rollout: TensorDictBase) -> tuple[Tensor, Tensor]:

@@ -25,6 +25,11 @@ STATE = ("next", "recurrent_state")
 def output_keys(actor: TensorDictModuleBase) -> list[NestedKey]:
     """What a rollout keeps of an actor's outputs: its samples and their log-probabilities."""
     samples: Any = getattr(actor, "dist_sample_keys", None)
+    if not hasattr(actor, "out_keys"):
+        raise UserError(
+            f"the collector takes a TensorDict module as actor, this is a {type(actor).__name__}: wrap it, "
+            "TensorDictModule(net, in_keys=['observation'], out_keys=['action'])"
+        )
     if not samples:
         return list(actor.out_keys)
     log_probs: Any = actor.log_prob_keys

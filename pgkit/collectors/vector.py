@@ -16,7 +16,7 @@ from pgkit.collectors.workers import Workers
 from pgkit.compiling import worth_compiling
 from pgkit.envs import VectorEnv
 from pgkit.envs.arrays import episode_seed
-from pgkit.errors import UserError
+from pgkit.errors import UserError, whole
 
 
 class VectorCollector:
@@ -55,7 +55,8 @@ class VectorCollector:
         compile: str = "auto",
     ) -> None:
         check_env(env, self)
-        if frames_per_batch < 1 or frames_per_batch % env.num_envs:
+        whole(1, frames_per_batch=frames_per_batch)
+        if frames_per_batch % env.num_envs:
             raise UserError(
                 f"frames_per_batch={frames_per_batch} is not a multiple of the {env.num_envs} environments: each takes "
                 "the same number of steps"

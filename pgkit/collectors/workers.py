@@ -24,6 +24,11 @@ from torchrl.data import TensorSpec
 from pgkit.collectors.policy import random_actions, trace
 from pgkit.collectors.stepping import Arrays, allocate, fill
 from pgkit.envs import ArrayEnv, VectorEnv
+from pgkit.errors import UserError
+
+
+class WorkerEnded(RuntimeError):
+    """A process is gone without an answer."""
 
 
 class Workers:
@@ -69,7 +74,13 @@ class Workers:
             self.pipes.append(ours)
             processes.append(process)
         self.close = weakref.finalize(self, _stop, self.pipes, processes)
-        self._answers()  # the processes are up
+        try:
+            self._answers()  # the processes are up
+        except WorkerEnded as error:
+            raise UserError(
+                "a collector worker ended before it began: what starts workers in a script belongs inside "
+                "`if __name__ == '__main__':`, as every worker imports the script; the lines above may tell more"
+            ) from error
 
     def begin(self, weights: Iterable[Tensor], seed: int, random: bool = False) -> None:
         """Starts a rollout with these weights, the values of the actor's ``state_dict()``."""
@@ -117,8 +128,12 @@ class Workers:
         for i, pipe in enumerate(self.pipes):
             try:
                 answer, failure = pipe.recv()
-            except EOFError:
-                answer, failure = None, "the process ended (killed, or out of memory)"
+            except (EOFError, ConnectionError):
+                self.close()
+                raise WorkerEnded(f"collector worker {i} ended (killed, or out of memory)") from None
+            if isinstance(failure, UserError):
+                self.close()
+                raise failure
             if failure:
                 self.close()
                 raise RuntimeError(f"collector worker {i} failed:\n{failure}")
@@ -179,6 +194,8 @@ def _serve(pipe: Connection, share: _Share) -> None:
             pipe.send((answer, None))
     except (EOFError, ConnectionError):
         pass
+    except UserError as error:
+        pipe.send((None, error))
     except Exception:
         pipe.send((None, traceback.format_exc()))
 

@@ -9,6 +9,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from pgkit.data.sum_tree import SumTree
+from pgkit.errors import within
 
 
 class Prioritized:
@@ -24,6 +25,7 @@ class Prioritized:
     """
 
     def __init__(self, alpha: float = 0.6, beta: float = 0.4, eps: float = 1e-6) -> None:
+        within(0, float("inf"), alpha=alpha, beta=beta, eps=eps)
         self.alpha, self.eps = alpha, eps
         self.beta = torch.tensor(float(beta))
         self.largest = torch.ones(1, dtype=torch.float64)  # [1]: a compiled graph loses writes to a float64 scalar

@@ -17,7 +17,7 @@ from torchrl.envs import EnvBase
 from pgkit.data import files
 from pgkit.data.gather import Gather, gather
 from pgkit.data.prioritized import Prioritized
-from pgkit.errors import UserError
+from pgkit.errors import UserError, whole
 
 
 class ReplayBuffer:
@@ -52,9 +52,12 @@ class ReplayBuffer:
         final_rows: int | None = None,
         seed: int | None = None,
     ) -> None:
+        if not isinstance(env, EnvBase):
+            raise UserError(f"ReplayBuffer(env, capacity): env is a {type(env).__name__}, give what envs.make gives")
+        if not (sampler is None or isinstance(sampler, Prioritized)):
+            raise UserError(f"sampler={sampler!r}: give data.Prioritized(), or None to draw uniformly")
+        whole(1, capacity=capacity, n_steps=n_steps, final_rows=final_rows)
         self.columns = env.batch_size.numel()
-        if n_steps < 1:
-            raise UserError(f"n_steps={n_steps}: a return has at least one step")
         if capacity < self.columns:
             raise UserError(
                 f"a replay buffer of capacity {capacity} does not hold one frame of each of the {self.columns} "
@@ -103,12 +106,21 @@ class ReplayBuffer:
                 f"the replay buffer was made for {self.columns} environments, the rollout's batch size is "
                 f"{tuple(rollout.batch_size)}: it must be [{self.columns}, T]"
             )
-        columns, dims, after = self.columns, rollout.batch_dims, rollout.get("next")
+        columns, dims, after = self.columns, rollout.batch_dims, rollout.get("next", None)
+        if after is None:
+            raise UserError(
+                "the rollout to store has no 'next': give next.observation, next.reward, next.terminated, ..."
+            )
         steps = rollout.batch_size.numel() // columns
         most = self.rows // columns - 1
 
         def rows_of(data: TensorDictBase, key: Any) -> Tensor:  # [T * columns, ...], in time order
-            x = data.get(key)
+            x = data.get(key, None)
+            if x is None:
+                where = "next" if data is after else "rollout"
+                raise UserError(f"the {where} to store has no '{key}', only {', '.join(map(str, data.keys()))}")
+            if key in self.observation_keys:
+                x = x.to(self.observations[key].dtype)
             if steps == 1:
                 return x.reshape(columns, *x.shape[dims:])
             x = x.reshape(columns, steps, *x.shape[dims:]).transpose(0, 1)
@@ -219,8 +231,9 @@ class ReplayBuffer:
             if oldest > self.start and not self._warned:
                 self._warned = True
                 getLogger("pgkit").warning(
-                    "episodes end more often than the replay has room for final observations (%d): old frames leave "
-                    "before there are %d; ReplayBuffer(final_rows=...) is that room",
+                    "episodes end, or frames do not continue one another, more often than the replay has room for "
+                    "final observations (%d): old frames leave before there are %d; ReplayBuffer(final_rows=...) is "
+                    "that room, as large as the capacity for frames in no order",
                     self.final_rows, self.capacity,
                 )  # fmt: skip
             self.start = max(self.start, oldest)

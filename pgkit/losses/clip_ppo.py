@@ -10,6 +10,7 @@ from tensordict.nn import TensorDictModule, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
 
+from pgkit.errors import within
 from pgkit.functional import approx_kl, clip_surrogate, same_shape
 from pgkit.functional.values import Distance
 from pgkit.losses.actor_critic_base import ActorCriticLoss
@@ -69,6 +70,8 @@ class ClipPPOLoss(ActorCriticLoss):
     ) -> None:
         pair = isinstance(clip_epsilon, tuple | list)
         low, high = clip_epsilon if pair else (clip_epsilon, clip_epsilon)
+        within(0, float("inf"), clip_epsilon=low)
+        within(0, float("inf"), clip_epsilon=high)
         if clip_value is True and low != high:
             raise ValueError(
                 "clip_value=True takes clip_epsilon's value, which is a pair here: give clip_value a number"

@@ -15,7 +15,7 @@ from torchrl.modules import Delta, TanhDelta
 from torchrl.modules.distributions.utils import rsample_and_log_prob
 from torchrl.objectives.utils import ValueEstimators, _vmap_func
 
-from pgkit.errors import UserError
+from pgkit.errors import UserError, within
 from pgkit.functional import bootstrap_target
 from pgkit.heads import Head, Scalar
 from pgkit.losses.base import Loss
@@ -78,6 +78,7 @@ class QLoss(Loss):
         head: Head | None = None,
     ) -> None:
         super().__init__(reduction)
+        within(0, 1, gamma=gamma)
         self.register_coeff_buffer("gamma", gamma)
         self.delay_actor, self.delay_qvalue = delay_actor, delay_qvalue
         self.convert_to_functional(actor_network, "actor_network", create_target_params=delay_actor)

@@ -73,6 +73,11 @@ class SoftQLoss(QLoss):
             actor_network, qvalue_network, num_qvalue_nets=num_qvalue_nets, gamma=gamma, delay_actor=delay_actor,
             delay_qvalue=delay_qvalue, separate_losses=separate_losses, reduction=reduction, head=head,
         )  # fmt: skip
+        if temperature is not None and not (hasattr(temperature, "alpha") and hasattr(temperature, "loss")):
+            raise UserError(
+                f"temperature={temperature!r}: give a block with alpha and loss (controllers.Temperature, "
+                "controllers.FixedTemperature(0.2))"
+            )
         self.set_distance(loss_function)
         if subset is not None and not 1 <= subset <= self.num_critics:
             raise UserError(f"subset={subset} of {self.num_critics} critics: give a number from 1 to the latter")

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
 from pgkit.modules.ensemble import EnsembleBatchRenorm, EnsembleDropout, EnsembleLayerNorm, EnsembleLinear
-from pgkit.modules.sizes import observation_size
+from pgkit.modules.sizes import layer_sizes, observation_size
 
 Layers = tuple[list[nn.Module], int]
 Body = Callable[[int, int], Layers]
@@ -35,7 +35,7 @@ def ensemble_mlp(
         dropout: probability of a zero, drawn for every member, row and unit.
     """
     layers: list[nn.Module] = []
-    for size in hidden:
+    for size in layer_sizes(hidden):
         layers.append(EnsembleLinear(num, features, size, gain=2**0.5))
         layers += [EnsembleDropout(dropout)] if dropout else []
         layers += [norm(num, size)] if norm else []
@@ -56,7 +56,7 @@ def batch_renorm_mlp(
     Bhatt et al., 2024 (https://arxiv.org/abs/1902.05605). Arguments as in :func:`ensemble_mlp`.
     """
     layers: list[nn.Module] = [norm(num, features)]
-    for size in hidden:
+    for size in layer_sizes(hidden):
         layers += [EnsembleLinear(num, features, size, gain=2**0.5), activation(), norm(num, size)]
         features = size
     return layers, features

@@ -85,7 +85,7 @@ class MaskedHead(nn.Module):
 class MultiCategorical(distributions.Independent):
     """Independent choices: ``logits [*B, sum(choices)]``, actions ``[*B, len(choices)]``, log-probability ``[*B]``."""
 
-    has_rsample = False  # said by the class, as those of single choices do
+    has_rsample = False  # pyright: ignore[reportAssignmentType]  # said by the class, as those of single choices do
 
     def __init__(self, logits: Tensor, choices: Sequence[int]) -> None:
         least, most = torch.finfo(logits.dtype).min, max(choices)

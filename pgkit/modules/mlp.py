@@ -7,6 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import nn
 
+from pgkit.modules.sizes import layer_sizes
+
 
 def mlp(
     in_features: int,
@@ -31,7 +33,7 @@ def mlp(
             et al., 2021, https://arxiv.org/abs/2006.05990).
     """
     layers: list[nn.Module] = []
-    for size in hidden:
+    for size in layer_sizes(hidden):
         layers.append(orthogonal(nn.Linear(in_features, size), hidden_gain))
         layers += [nn.LayerNorm(size), activation()] if layer_norm else [activation()]
         in_features = size

@@ -12,7 +12,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
-from pgkit.errors import UserError
+from pgkit.errors import UserError, whole
 from pgkit.heads import Head
 from pgkit.modules.bodies import Body, Layers, Norm, ensemble_mlp
 from pgkit.modules.ensemble import EnsembleLinear
@@ -52,6 +52,7 @@ def q_value(
         encoder: one module from the observation, or from the entries that its attribute ``in_keys`` names
             (:func:`~pgkit.modules.dict_encoder`), to the features that all critics read beside the action.
     """
+    whole(1, num_critics=num_critics)
     inputs, features = trunk(env, (), activation, normalizer, encoder)
     layers, last = _layers(num_critics, features + action_size(env), hidden, activation, norm, dropout, body)
     layers.append(EnsembleLinear(num_critics, last, 1 if head is None else head.size, gain=1.0))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import prod
 
 import torch
@@ -14,6 +15,7 @@ from pgkit.errors import UserError
 
 def observation_shape(env: EnvBase, key: NestedKey = "observation") -> torch.Size:
     """Shape of one observation, without the environment's batch dimensions."""
+    _check(env)
     spec = env.observation_spec_unbatched
     if key not in spec.keys(True):
         raise UserError(
@@ -36,6 +38,7 @@ def observation_size(env: EnvBase, key: str = "observation") -> int:
 
 def box_action(env: EnvBase, needs_bounds: bool = False) -> TensorSpec:
     """Spec of one continuous action; a ``UserError`` names the right builder otherwise."""
+    _check(env)
     spec = env.action_spec_unbatched
     if not spec.dtype.is_floating_point:
         raise UserError(
@@ -55,3 +58,17 @@ def box_action(env: EnvBase, needs_bounds: bool = False) -> TensorSpec:
 def action_size(env: EnvBase) -> int:
     """Number of dimensions of one continuous action."""
     return prod(box_action(env).shape)
+
+
+def layer_sizes(hidden: Sequence[int]) -> list[int]:
+    """Sizes of hidden layers as a list; a ``UserError`` for a single number."""
+    if isinstance(hidden, int):
+        raise UserError(f"hidden={hidden}: give the sizes of the layers, hidden=({hidden},) for one")
+    return list(hidden)
+
+
+def _check(env: EnvBase) -> None:
+    if not isinstance(env, EnvBase):
+        raise UserError(
+            f"sizes are read off a TorchRL environment, this is a {type(env).__name__}: give envs.make(...)"
+        )

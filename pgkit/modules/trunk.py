@@ -33,8 +33,15 @@ def trunk(
             "put normalizers into the encoders of single entries (nn.Sequential(normalizer, encoder))"
         )
     else:
-        with torch.no_grad():
-            features = first(encoder(*(_zero(env, encoder, key) for key in reads(encoder)))).shape[-1]
+        examples = [_zero(env, encoder, key) for key in reads(encoder)]
+        try:
+            with torch.no_grad():
+                features = first(encoder(*examples)).shape[-1]
+        except (RuntimeError, ValueError, TypeError) as error:
+            found = ", ".join(str(tuple(x.shape)) for x in examples)
+            raise UserError(
+                f"encoder={type(encoder).__name__} cannot take an observation {found}: {str(error).splitlines()[0]}"
+            ) from error
     return [encoder] if normalizer is None else [normalizer, encoder], features
 
 

@@ -85,6 +85,24 @@ def wrong_action(chain: Chain, batch: TensorDictBase) -> str | None:
     return None
 
 
+def another_policy(chain: Chain, batch: TensorDictBase) -> str | None:
+    """Whether the first batch's log-probabilities are far from those of the loss's actor; None if all is well."""
+    stored = [batch.get(key, None) for key in _log_prob(chain)]
+    action, dist = [batch.get(key, None) for key in chain.keys("action")], chain.distribution(batch)
+    if dist is None or len(stored) != 1 or len(action) != 1 or stored[0] is None:
+        return None
+    try:
+        gap = float((dist.log_prob(action[0]) - stored[0]).abs().mean())
+    except (ValueError, RuntimeError, NotImplementedError):
+        return None
+    if gap < 0.01:
+        return None
+    return (
+        f"the log-probabilities of the first batch differ by {gap:.2g} on average from those of {chain.name}'s actor: "
+        "is the loss built on the actor that collects?"
+    )
+
+
 def check_values(chain: Chain, batch: TensorDictBase, out: TensorDictBase, losses: list[str]) -> None:
     """A loss that is not finite is traced to the entry that is to blame."""
     bad = [key for key in losses if not out[key].isfinite().all()]

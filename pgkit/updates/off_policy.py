@@ -9,9 +9,9 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from pgkit.compiling import worth_compiling
+from pgkit.compiling import check_compile, worth_compiling
 from pgkit.data import ReplayBuffer
-from pgkit.errors import UserError
+from pgkit.errors import UserError, whole, within
 from pgkit.updates import optimizers, restoring, wiring
 from pgkit.updates.batches import Batches, OwnBatches, TorchRLBatches
 from pgkit.updates.chain import Chain
@@ -61,6 +61,15 @@ class OffPolicyUpdate:
         total_frames: int | None = None,
         compile: str = "auto",
     ) -> None:
+        optimizers.check_optimizer(optimizer)
+        check_compile(compile)
+        whole(1, batch_size=batch_size, actor_delay=actor_delay)
+        within(0, 1, tau=tau)
+        within(0, float("inf"), updates_per_step=updates_per_step)
+        if not hasattr(buffer, "sample"):
+            raise UserError(
+                f"the update draws from a replay buffer, this is a {type(buffer).__name__}: use data.ReplayBuffer"
+            )
         if learning_starts < batch_size:
             raise UserError(
                 f"batch_size={batch_size} is above the learning_starts={learning_starts} frames stored at the first "

@@ -13,14 +13,15 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from pgkit.compiling import worth_compiling
-from pgkit.errors import UserError
+from pgkit.compiling import check_compile, worth_compiling
+from pgkit.errors import UserError, whole, within
 from pgkit.functional import standardize
 from pgkit.updates import restoring, wiring
 from pgkit.updates.chain import Chain
 from pgkit.updates.diagram import diagram
+from pgkit.updates.optimizers import check_optimizer
 from pgkit.updates.recorded import Block, recorded_block
-from pgkit.updates.sequences import as_rows, check_one_memory
+from pgkit.updates.sequences import as_rows, check_one_memory, check_time
 from pgkit.updates.step import GradientStep
 
 
@@ -67,9 +68,19 @@ class OnPolicyUpdate:
         compile: str = "auto",
         seed: int | None = None,
     ) -> None:
+        check_optimizer(optimizer)
+        check_compile(compile)
+        whole(1, epochs=epochs, minibatch_size=minibatch_size, sequence_length=sequence_length)
+        within(0, float("inf"), target_kl=target_kl)
         if schedules and total_frames is None:
             raise UserError("schedules are functions of the progress: give total_frames too")
-        for name in schedules or {}:
+        schedules = schedules or {}
+        for name in schedules:
+            if not callable(schedules[name]):
+                raise UserError(
+                    f"schedules: '{name}' is {schedules[name]!r}, give a function of the progress in [0, 1] "
+                    "(controllers.linear)"
+                )
             if name != "lr" and not isinstance(getattr(loss, name, None), Tensor):
                 names = sorted(getattr(loss, "_schedulable_buffers", ()))
                 known = ["lr", *[key for key in names if isinstance(getattr(loss, key, None), Tensor)]]
@@ -103,6 +114,8 @@ class OnPolicyUpdate:
 
         Time is the last dimension: flattened, an advantage would run from one environment into the next.
         """
+        if self._step is None and self.advantage is not None:
+            check_time(rollout)
         self._follow_schedules()
         length = self.sequence_length or 1
         rows = rollout.numel() // length

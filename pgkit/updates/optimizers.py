@@ -13,12 +13,13 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.compiler import is_compiling
-from torch.optim import SGD, Adam, AdamW, Optimizer, RMSprop
+from torch.optim import LBFGS, SGD, Adam, AdamW, Optimizer, RMSprop
 from torch.optim.adam import adam
 from torch.optim.rmsprop import rmsprop
 from torch.optim.sgd import sgd
 
 from pgkit.compiling import computed_once
+from pgkit.errors import UserError
 
 Apply = Callable[[list[Tensor]], None]
 Functional = tuple[Apply, Callable[[], None], list[Tensor]]
@@ -32,6 +33,8 @@ class Together:
     """
 
     def __init__(self, *parts: Optimizer) -> None:
+        for part in parts:
+            check_optimizer(part)
         self.parts = parts
 
     @property
@@ -62,6 +65,16 @@ class Together:
         """Restores :meth:`state_dict`."""
         for part, own in zip(self.parts, state["parts"], strict=True):
             part.load_state_dict(own)
+
+
+def check_optimizer(optimizer: Any) -> None:
+    """A ``UserError`` for what is no optimizer over gradients: a list of them, a class, one that wants a closure."""
+    if isinstance(optimizer, list | tuple):
+        raise UserError("several optimizers are one block: updates.Together(first, second)")
+    if not hasattr(optimizer, "param_groups"):
+        raise UserError(f"optimizer is a {type(optimizer).__name__}: give torch.optim.Adam(loss.parameters(), lr=3e-4)")
+    if isinstance(optimizer, LBFGS):
+        raise UserError("LBFGS evaluates the loss several times a step, an update does once: use another optimizer")
 
 
 def parameters(optimizer: Optimizer) -> list[Tensor]:

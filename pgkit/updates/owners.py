@@ -39,6 +39,12 @@ def check_parameters(chain: Chain, optimizer: Optimizer, total: Tensor) -> None:
     def called(p: Tensor) -> str:
         return f"'{names[id(p)]}'" if id(p) in names else f"of shape {tuple(p.shape)}"
 
+    if len(ids) < len(trained):
+        twice = next(p for p in trained if sum(p is other for other in trained) > 1)
+        raise UserError(
+            f"the optimizer holds parameter {called(twice)} twice and would step it twice: build it from "
+            "loss.parameters(), which has every one once"
+        )
     held = {chain.name: chain.loss}
     if isinstance(chain.advantage, nn.Module):
         held[type(chain.advantage).__name__] = chain.advantage

@@ -47,3 +47,22 @@ def check_one_memory(loss: nn.Module, advantage: Any) -> None:
                 f"the critic of {type(advantage).__name__} has a recurrent core of its own, the rollout has the state "
                 "of the actor's only: make one core = modules.gru(env) and give it to both as encoder="
             )
+
+
+def check_time(rollout: TensorDictBase) -> None:
+    """A flat rollout must be one environment's steps: an advantage runs along the last dimension.
+
+    Raises:
+        UserError: a step goes on where the one before it did not end.
+    """
+    after: Any = rollout.get("next", None)
+    if rollout.batch_dims != 1 or after is None or "observation" not in after.keys():
+        return
+    reached, seen = after["observation"][:-1], rollout["observation"][1:]
+    broken = (reached != seen).flatten(1).any(-1) & ~after["done"][:-1].squeeze(-1)
+    if broken.any():
+        step = int(broken.nonzero()[0])
+        raise UserError(
+            f"the rollout of batch size [{len(rollout)}] is not one environment's: step {step + 1} does not begin "
+            f"where step {step} led. Give the rollout as [environments, steps], time last, not flattened"
+        )

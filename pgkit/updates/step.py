@@ -110,6 +110,7 @@ class GradientStep:
     def begin(self) -> None:
         """Reads the learning rates off the optimizer; call it before a series of steps."""
         self._read_learning_rates()
+        self.optimizer._opt_called = True  # what torch's schedulers look at before they warn that none stepped
 
     def __call__(self, data: TensorDictBase, index: Tensor) -> Tensor:
         """One step on the rows ``index`` of ``data``; metrics ``[len(names)]``, still on the device."""

@@ -10,13 +10,13 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torch.optim import SGD, Optimizer
 
-from pgkit.compiling import worth_compiling
-from pgkit.errors import UserError
+from pgkit.compiling import check_compile, worth_compiling
+from pgkit.errors import UserError, whole, within
 from pgkit.functional import conjugate_gradient
 from pgkit.updates import restoring, wiring
 from pgkit.updates.chain import Chain
 from pgkit.updates.diagram import diagram
-from pgkit.updates.optimizers import parameters
+from pgkit.updates.optimizers import check_optimizer, parameters
 from pgkit.updates.sequences import as_rows
 from pgkit.updates.step import GradientStep
 
@@ -76,6 +76,11 @@ class TrustRegionUpdate:
         compile: str = "auto",
         seed: int | None = None,
     ) -> None:
+        if optimizer is not None:
+            check_optimizer(optimizer)
+        check_compile(compile)
+        whole(1, epochs=epochs, minibatch_size=minibatch_size, cg_steps=cg_steps)
+        within(0, float("inf"), max_kl=max_kl, damping=damping)
         self.loss, self.advantage, self.optimizer = loss, advantage, optimizer
         self.max_kl, self.cg_steps, self.damping = max_kl, cg_steps, damping
         self.sizes = [backtrack_factor**j for j in range(backtracks + 1)] if line_search else [1.0]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import fields
+from logging import getLogger
 from typing import Any
 
 import torch
@@ -15,6 +16,7 @@ from pgkit.errors import UserError
 from pgkit.updates import entries, owners
 from pgkit.updates.chain import Chain, is_loss
 from pgkit.updates.restoring import undone
+from pgkit.updates.tables import NoTables, TableError
 
 
 def read_keys(loss: nn.Module, data: TensorDictBase) -> list[Any]:
@@ -65,6 +67,8 @@ def _trial(chain: Chain, optimizer: Optimizer, batch: TensorDictBase) -> list[st
     _check_result(chain, batch, out)
     if reason := entries.wrong_action(chain, batch):
         raise UserError(reason)
+    if reason := entries.another_policy(chain, batch):
+        getLogger("pgkit").warning(reason)
     total = torch.stack([out[key].sum() for key in out.keys() if is_loss(key)]).sum()
     owners.check_parameters(chain, optimizer, total)
     return [key for key in out.keys() if out[key].numel() == 1]
@@ -72,7 +76,7 @@ def _trial(chain: Chain, optimizer: Optimizer, batch: TensorDictBase) -> list[st
 
 def _run(chain: Chain, batch: TensorDictBase) -> TensorDictBase:
     try:
-        return chain.loss(batch.copy())
+        return _without_tables(chain, batch)
     except UserError:
         raise
     except (KeyError, ValueError, TypeError, RuntimeError, IndexError) as error:
@@ -82,7 +86,27 @@ def _run(chain: Chain, batch: TensorDictBase) -> TensorDictBase:
         raise UserError(reason) from error
 
 
+def _without_tables(chain: Chain, batch: TensorDictBase) -> TensorDictBase:
+    try:
+        with NoTables(chain.name):
+            return chain.loss(batch.copy())
+    except TableError as error:
+        if reason := entries.wrong_action(chain, batch):
+            raise UserError(reason) from error
+        try:
+            with NoTables(chain.name):  # with fewer rows, as a network may have as many features
+                chain.loss(batch[:-1])
+        except TableError:
+            raise error from None
+        return chain.loss(batch.copy())
+
+
 def _check_result(chain: Chain, batch: TensorDictBase, out: TensorDictBase) -> None:
+    if not hasattr(out, "keys"):
+        raise UserError(
+            f"{chain.name} returned a {type(out).__name__}: return a TensorDict or dict, every entry that begins with "
+            "'loss_' is minimized"
+        )
     losses = [key for key in out.keys() if is_loss(key)]
     if not losses:
         raise UserError(

@@ -5,6 +5,7 @@
 Each function makes one mistake; its docstring names it. The test runs them all and compares the page.
 """
 
+import warnings
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -12,8 +13,8 @@ from typing import Any
 
 import torch
 import torchrl.objectives
-from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import MultiStepTransform
 
@@ -250,6 +251,55 @@ def no_loss_entry() -> None:
     agent.train()
 
 
+def own_loss_that_broadcasts() -> None:
+    """A loss of one's own multiplies log-probabilities ``(B,)`` with advantages ``(B, 1)``."""
+    agent = Agent()
+
+    class Mine(losses.PolicyLoss):
+        def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+            log_prob = self.log_prob(self.distribution(tensordict), tensordict)
+            error = self.value(tensordict) - tensordict["value_target"]
+            objective = (log_prob * tensordict["advantage"]).mean()
+            return TensorDict({"loss_objective": -objective, "loss_critic": error.square().mean()})
+
+        def _writes(self) -> list[Any]:
+            return ["loss_objective", "loss_critic"]
+
+    agent.loss = Mine(agent.actor, agent.critic)
+    agent.train()
+
+
+def flattened_rollout() -> None:
+    """The rollout of several environments was flattened, so that an advantage would run from one into the next."""
+    agent = Agent()
+    agent.rollout = agent.rollout.reshape(-1)
+    agent.train()
+
+
+def advantage_of_the_actor() -> None:
+    """The advantage block was given the actor in place of the critic."""
+    agent = Agent()
+    agent.advantage = advantages.GAE(agent.actor)
+    agent.train()
+
+
+def critic_of_two_values() -> None:
+    """The critic has two outputs."""
+    agent = Agent()
+    agent.critic = TensorDictModule(torch.nn.Linear(3, 2), ["observation"], ["state_value"])
+    agent.loss, agent.advantage = losses.ClipPPOLoss(agent.actor, agent.critic), advantages.GAE(agent.critic)
+    agent.train()
+
+
+def shared_parameter_twice() -> None:
+    """Actor and critic share layers, and the optimizer has both lists of parameters."""
+    agent = Agent()
+    agent.parameters += [*agent.critic.parameters()]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # torch's, which many a log hides
+        agent.train()
+
+
 MISTAKES: list[Callable[[], None]] = [
     no_advantage_block, advantage_under_another_name, advantage_without_the_trailing_1,
     log_probability_with_a_trailing_1, no_log_probability, random_actions_in_the_rollout, observation_of_another_type,
@@ -257,6 +307,7 @@ MISTAKES: list[Callable[[], None]] = [
     action_out_of_range, action_outside_the_bounds, reward_without_the_trailing_1, flags_as_numbers,
     parameter_without_optimizer, optimizer_of_another_agent, frozen_parameter_in_the_optimizer, two_critics,
     two_owners_of_gamma, two_owners_of_gamma_in_the_replay, two_owners_of_lambda, a_loss_a_row, no_loss_entry,
+    own_loss_that_broadcasts, flattened_rollout, advantage_of_the_actor, critic_of_two_values, shared_parameter_twice,
 ]  # fmt: skip
 
 

@@ -43,7 +43,7 @@ def test_what_is_right_passes_and_leaves_no_trace():
     agent.loss.forward = counting
     state = torch.get_rng_state()
     optimizer = torch.optim.Adam(agent.parameters)
-    update = updates.OnPolicyUpdate(agent.loss, agent.advantage, optimizer, epochs=0, compile="off", seed=0)
+    update = updates.OnPolicyUpdate(agent.loss, agent.advantage, optimizer, epochs=1, compile="off", seed=0)
     update._assemble(update._flatten(agent.rollout), 32, 64)
     assert len(seen) == 1 and agent.loss.calls == 0 and torch.equal(state, torch.get_rng_state())
 

@@ -1,0 +1,45 @@
+"""The slip of ``(B,)`` with ``(B, 1)``, which torch broadcasts to a table ``(B, B)`` without a word."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from torch import Tensor
+from torch.overrides import TorchFunctionMode
+
+from pgkit.errors import UserError
+
+_ELEMENTWISE = {"add", "radd", "sub", "rsub", "mul", "rmul", "div", "truediv", "rtruediv", "rdiv", "pow", "where"}
+_ELEMENTWISE |= {"minimum", "maximum", "l1_loss", "mse_loss", "smooth_l1_loss", "huber_loss"}
+
+
+class TableError(UserError):
+    """A ``(B,)`` and a ``(B, 1)`` became a ``(B, B)``."""
+
+
+class NoTables(TorchFunctionMode):
+    """Within it, an elementwise operation on a ``(B,)`` and a ``(B, 1)`` raises :class:`TableError`.
+
+    Args:
+        name: of whose operations they are.
+    """
+
+    def __init__(self, name: str) -> None:
+        super().__init__()
+        self.name = name
+
+    def __torch_function__(
+        self, func: Callable[..., Any], types: Any, args: Sequence[Any] = (), kwargs: Mapping[str, Any] | None = None
+    ) -> Any:
+        name = getattr(func, "__name__", "").strip("_")
+        if name in _ELEMENTWISE:
+            shapes = {tuple(x.shape) for x in args if isinstance(x, Tensor)}
+            rows = max((shape[0] for shape in shapes if shape), default=0)
+            if rows > 1 and shapes == {(rows,), (rows, 1)}:
+                raise TableError(
+                    f"{self.name} broadcasts a ({rows},) and a ({rows}, 1) to ({rows}, {rows}), in '{name}': "
+                    "unsqueeze(-1) the first or squeeze(-1) the second (for a table that is meant, unsqueeze(0) the "
+                    "first)"
+                )
+        return func(*args, **(kwargs or {}))

@@ -1,0 +1,107 @@
+"""Wrong arguments are answered at once, with one line that says what to give."""
+
+from functools import partial
+
+import gymnasium as gym
+import pytest
+import torch
+from torch import nn
+
+from pgkit import advantages, collectors, data, envs, losses, modules, updates
+from pgkit.errors import UserError, whole, within
+
+ENV = envs.make("Pendulum-v1")
+ACTOR, CRITIC = modules.gaussian_actor(ENV, (8,)), modules.state_value(ENV, (8,))
+ADAM = torch.optim.Adam([*ACTOR.parameters(), *CRITIC.parameters()])
+PPO = partial(updates.OnPolicyUpdate, losses.ClipPPOLoss(ACTOR, CRITIC), advantages.GAE(CRITIC))
+SAC = partial(losses.SACLoss, modules.tanh_normal_actor(ENV, (8,)), modules.q_value(ENV, 2, (8,)))
+REPLAYED = partial(updates.OffPolicyUpdate, SAC(), data.ReplayBuffer(ENV, 2000), ADAM)
+STORED = ENV.rollout(4).exclude("action_log_prob")
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: PPO(ADAM, epochs=0), "epochs=0: give a whole number, at least 1"),
+        (lambda: PPO(ADAM, minibatch_size=32.0), "minibatch_size=32.0: give a whole number"),
+        (lambda: PPO(ADAM, target_kl=-1), "target_kl=-1: give a number that is at least 0"),
+        (lambda: PPO(ADAM, compile=False), "compile is 'auto', 'on' or 'off', not False"),
+        (lambda: PPO([ADAM, ADAM]), "several optimizers are one block: updates.Together"),
+        (lambda: PPO(torch.optim.Adam), "optimizer is a type: give torch.optim.Adam"),
+        (lambda: PPO(torch.optim.LBFGS(ACTOR.parameters())), "LBFGS evaluates the loss several times"),
+        (lambda: updates.Together([ADAM, ADAM]), "several optimizers are one block"),
+        (lambda: PPO(ADAM, schedules={"lr": 1e-3}, total_frames=9), "'lr' is 0.001, give a function of the progress"),
+        (lambda: REPLAYED(tau=5), "tau=5: give a number from 0 to 1"),
+        (lambda: REPLAYED(actor_delay=0), "actor_delay=0: give a whole number"),
+        (lambda: REPLAYED(updates_per_step=-1), "updates_per_step=-1: give a number that is at least 0"),
+        (lambda: updates.OffPolicyUpdate(SAC(), None, ADAM), "draws from a replay buffer, this is a NoneType"),
+        (lambda: updates.TrustRegionUpdate(losses.TRPOLoss(ACTOR), None, cg_steps=0), "cg_steps=0"),
+        (lambda: advantages.GAE(CRITIC, gamma=2), "gamma=2: give a number from 0 to 1"),
+        (lambda: advantages.GAE(CRITIC, lmbda=-1), "lmbda=-1: give a number from 0 to 1"),
+        (lambda: advantages.GAE(nn.Linear(3, 1)), "takes a TensorDict module as critic, this is a Linear"),
+        (lambda: SAC(gamma=2), "gamma=2: give a number from 0 to 1"),
+        (lambda: SAC(temperature=0.2), r"temperature=0.2: give a block .*controllers.FixedTemperature"),
+        (lambda: losses.ClipPPOLoss(ACTOR, clip_epsilon=-0.2), "clip_epsilon=-0.2: give a number"),
+        (lambda: data.Prioritized(alpha=-5), "alpha=-5: give a number"),
+        (lambda: data.ReplayBuffer(1000), "env is a int, give what envs.make gives"),
+        (lambda: data.ReplayBuffer(ENV, 1e3), "capacity=1000.0: give a whole number"),
+        (lambda: data.ReplayBuffer(ENV, 9, sampler="prioritized"), "sampler='prioritized': give data.Prioritized"),
+        (lambda: data.ReplayBuffer(ENV, 9).extend(STORED.exclude("next")), "rollout to store has no 'next'"),
+        (
+            lambda: data.ReplayBuffer(ENV, 9).extend(STORED.exclude("action")),
+            "the rollout to store has no 'action', o",
+        ),
+        (lambda: data.ReplayBuffer(ENV, 9).extend(STORED.exclude(("next", "done"))), "the next to store has no 'done'"),
+        (lambda: modules.gaussian_actor(ENV, hidden=64), r"hidden=64: give the sizes of the layers, hidden=\(64,\)"),
+        (lambda: modules.q_value(ENV, 2, hidden=64), "hidden=64: give the sizes"),
+        (lambda: modules.q_value(ENV, 0), "num_critics=0: give a whole number"),
+        (
+            lambda: modules.gaussian_actor(gym.make("Pendulum-v1")),
+            "a TorchRL environment, this is a TimeLimit",
+        ),
+        (lambda: modules.gaussian_actor(ENV, encoder=nn.Linear(4, 8)), r"encoder=Linear cannot take .* \(1, 3\): mat1"),
+        (lambda: collectors.VectorCollector(ENV, nn.Linear(3, 1), frames_per_batch=8), "as actor, this is a Linear"),
+        (lambda: collectors.VectorCollector(ENV, ACTOR, frames_per_batch=8.0), "frames_per_batch=8.0: give a whole"),
+    ],
+)
+def test_a_wrong_argument_is_named(call, message):
+    with pytest.raises(UserError, match=message) as caught:
+        call()
+    assert "\n" not in str(caught.value)
+
+
+def test_bounds_are_inclusive_and_none_passes():
+    whole(1, a=1, b=None)
+    within(0, 1, a=0, b=1.0, c=torch.tensor(0.5), d=None)
+    for low, high, value in ((0, 1, 1.01), (0, 1, float("nan")), (1, float("inf"), 0.5)):
+        with pytest.raises(UserError, match="^a="):
+            within(low, high, a=value)
+
+
+def test_a_batch_of_another_policy_is_said(caplog):
+    def trained_on(actor):
+        loss = losses.ClipPPOLoss(ACTOR, CRITIC)
+        update = updates.OnPolicyUpdate(
+            loss, advantages.GAE(CRITIC), torch.optim.SGD(loss.parameters(), lr=0.0), compile="off"
+        )
+        update(collectors.VectorCollector(ENV, actor, frames_per_batch=64, compile="off").rollout())
+        return "is the loss built on the actor that collects?" in caplog.text
+
+    assert not trained_on(ACTOR)
+    other = modules.gaussian_actor(ENV, (8,), log_std=0.0)
+    assert trained_on(other)
+
+
+def test_rows_that_are_as_many_as_features_are_no_broadcast_mistake():
+    class Waves(nn.Module):
+        frequencies = torch.arange(32.0)
+
+        def forward(self, x):
+            return (x[..., :1] * self.frequencies).sin()  # [32, 1] * [32]
+
+    critic = modules.state_value(ENV, encoder=Waves())
+    loss = losses.ClipPPOLoss(ACTOR, critic)
+    update = updates.OnPolicyUpdate(
+        loss, advantages.GAE(critic), torch.optim.SGD(loss.parameters(), lr=0.0), minibatch_size=32, compile="off"
+    )
+    assert update(collectors.VectorCollector(ENV, ACTOR, frames_per_batch=64, compile="off").rollout())["grad_norm"] > 0
