@@ -50,8 +50,7 @@ def _check_observation(env: gym.Env, method: str, obs: Any) -> None:
     else:
         parts = [("observation", space, None)]
     for name, part, key in parts:
-        found = np.shape(obs if key is None else obs[key])
-        if isinstance(part, spaces.Box) and found != part.shape:
+        if isinstance(part, spaces.Box) and (found := np.shape(obs if key is None else obs[key])) != part.shape:
             raise UserError(
                 f"{_name(env)}.{method} returned {name} of shape {found}, its space says {part.shape}: make them agree"
             )

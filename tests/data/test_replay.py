@@ -234,6 +234,7 @@ def test_evicted_frames_are_warned_of_once(caplog):
     for first in (0, 100, 200):
         buffer.extend(hand_made(list(range(first, first + 20)), [0.0] * 19, truncated=range(19)))
     assert [record.message for record in caplog.records] == [
-        "episodes end more often than the replay has room for final observations (2): old frames leave before there "
-        "are 16; ReplayBuffer(final_rows=...) is that room"
+        "episodes end, or frames do not continue one another, more often than the replay has room for final "
+        "observations (2): old frames leave before there are 16; ReplayBuffer(final_rows=...) is that room, as large "
+        "as the capacity for frames in no order"
     ]

@@ -206,7 +206,7 @@ def test_unreduced_losses_have_the_batch_s_shape(agent):
 
 def test_a_composite_action_in_an_update_and_in_vtrace():
     actor, _, batch = composite_actor()
-    after = {"observation": torch.randn(8, 3), "reward": torch.ones(8, 1)}
+    after = {"observation": batch["observation"].roll(-1, 0), "reward": torch.ones(8, 1)}
     batch["next"] = after | dict.fromkeys(("done", "terminated"), torch.zeros(8, 1, dtype=torch.bool))
     critic = TensorDictModule(nn.Linear(3, 1), ["observation"], ["state_value"])
     parameters = [*actor.parameters(), *critic.parameters()]
