@@ -67,7 +67,8 @@ class ArrayEnv:
         self.step_count = np.zeros(self.num_envs, np.int64)
         self.fresh = np.zeros(self.num_envs, bool)
         self._episode = np.full(self.num_envs, -1)
-        self._history: list[list[Any]] = [[] for _ in range(self.num_envs)]
+        self._taken: list[np.ndarray] = []  # actions [N, ...] of the last steps
+        self._since = np.zeros(self.num_envs, np.int64)  # where in those each episode begins
 
     def _begin(self, i: int) -> None:
         self._episode[i] += 1
@@ -75,7 +76,11 @@ class ArrayEnv:
         result = self.envs[i].reset(seed=seed) if self._episode[i] else checked_reset(self.envs[i], seed)
         self._write(self.obs[i], result[0])
         self.fresh[i] = True
-        self._history[i] = []
+        self._since[i] = len(self._taken)
+        oldest = int(self._since.min())
+        if 2 * oldest > len(self._taken):  # more than half belongs to episodes that are over
+            del self._taken[:oldest]
+            self._since -= oldest
 
     def reset(self, mask: np.ndarray | None = None) -> np.ndarray:
         """Starts a new episode where ``mask`` (``[N]``, all by default) is set, unless one has just started."""
@@ -102,7 +107,7 @@ class ArrayEnv:
             obs, reward, terminated, truncated, _ = result
             self._write(self._next_obs[i], obs)
             self._reward[i], self._terminated[i], self._truncated[i] = reward, terminated, truncated
-            self._history[i].append(actions[i])
+        self._taken.append(actions)
         self._stepped = True
         self.episode_reward += self._reward
         self.step_count += 1
@@ -115,23 +120,29 @@ class ArrayEnv:
 
     def state_dict(self) -> dict[str, Any]:
         """Episode numbers and the actions taken since each episode began."""
-        history = [np.array(actions) for actions in self._history]
+        history = [np.array([actions[i] for actions in self._taken[since:]]) for i, since in enumerate(self._since)]
         state = {"seed": self.seed, "episode": self._episode.copy(), "history": history}
         return state if self.memory is None else state | {"memory": self.memory.copy()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restores every environment by replaying the actions of its current episode."""
-        self.seed, self.memory = state["seed"], state.get("memory")
+        self.seed, self.memory, history = state["seed"], state.get("memory"), state["history"]
         for i, env in enumerate(self.envs):
             self._episode[i] = state["episode"][i] - 1
             self._begin(i)
-            self.episode_reward[i], self.step_count[i] = 0.0, len(state["history"][i])
-            for action in state["history"][i]:
+            self.episode_reward[i], self.step_count[i] = 0.0, len(history[i])
+            for action in history[i]:
                 obs, reward, *_ = env.step(action)
                 self._write(self.obs[i], obs)
                 self.episode_reward[i] += np.float32(reward)
-                self._history[i].append(action)
                 self.fresh[i] = False
+        longest = max(history, key=len)
+        taken = np.zeros((len(longest), self.num_envs, *longest.shape[1:]), longest.dtype)
+        self._since = np.array([len(longest) - len(actions) for actions in history])
+        for i in range(self.num_envs):
+            if len(history[i]):
+                taken[self._since[i] :, i] = history[i]
+        self._taken = list(taken)
 
     def close(self) -> None:
         for env in self.envs:

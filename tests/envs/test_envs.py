@@ -178,6 +178,22 @@ class Own(gym.Env):
         return (obs, reward, False, {}) if self.wrong == "step" else (obs, reward, self.end, False, {})
 
 
+def test_a_state_in_which_one_episode_has_just_begun_is_restored():
+    env, twin = (envs.make(Own, num_envs=2, max_episode_steps=4).arrays for _ in range(2))
+    env.reset()
+    env.step(np.zeros((2, 1)))
+    env.fresh[:] = [False, True]
+    env._begin(1)  # the second begins again
+    twin.load_state_dict(env.state_dict())
+    assert [len(x) for x in twin.state_dict()["history"]] == [1, 0]
+    for _ in range(4):
+        flags = [arrays.step(np.zeros((2, 1)))[3].tolist() for arrays in (env, twin)]
+        assert flags[0] == flags[1]
+    for _ in range(50):
+        env.step(np.zeros((2, 1)))
+    assert len(env._taken) < 10  # what is over is let go
+
+
 def test_keywords_and_a_time_limit_reach_a_class():
     env = envs.make(Own, num_envs=2, level=2, max_episode_steps=3)
     assert env.reset()["observation"].tolist() == [[2, 4, 6]] * 2
