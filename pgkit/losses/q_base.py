@@ -137,6 +137,11 @@ class QLoss(Loss):
         data = batch.select(*self.qvalue_network.in_keys, strict=False).set(self.tensor_keys.action, action)
         number = self.num_critics if members is None else None
         params, members = self.params_of(params, members)
+        if self.tensor_keys.state_action_value not in self.qvalue_network.out_keys:
+            raise UserError(
+                f"{type(self).__name__} reads '{self.tensor_keys.state_action_value}' of its critics, they write "
+                f"{', '.join(map(str, self.qvalue_network.out_keys))}: give modules.q_value(env), or set_keys(...)"
+            )
         if self._each is not None:
             out = self._each(data, params).get(self.tensor_keys.state_action_value)
             out = (out if out.dim() == data.dim() + 2 else out.squeeze(-2)).movedim(0, -2)

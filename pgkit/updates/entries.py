@@ -22,6 +22,8 @@ def check_form(chain: Chain, batch: TensorDictBase) -> None:
     size = tuple(batch.batch_size)
     for key in keys:
         x = batch.get(key, None)
+        if isinstance(x, Tensor) and x.requires_grad:
+            raise _wrong(chain, key, "part of a graph", "no gradient", "compute it under torch.no_grad()")
         if isinstance(x, Tensor) and tuple(x.shape) == size:
             raise _wrong(chain, key, shape(x), str((*size, 1)), "keep the trailing 1, unsqueeze(-1)")
     for key in chain.keys("sample_log_prob"):

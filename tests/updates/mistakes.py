@@ -291,6 +291,23 @@ def critic_of_two_values() -> None:
     agent.train()
 
 
+def advantage_with_a_gradient() -> None:
+    """An advantage block of one's own keeps the graph of its critic."""
+    agent = Agent()
+    agent.advantage = MyAdvantage(
+        lambda rollout: rollout.set("advantage", agent.critic(rollout.copy())["state_value"]),
+        ("advantage", "value_target"),
+    )
+    agent.train()
+
+
+def critics_of_states() -> None:
+    """An off-policy loss was given a critic of states in place of critics of actions."""
+    agent = ReplayAgent()
+    agent.loss = losses.SACLoss(agent.actor, modules.state_value(agent.env, hidden=(8,)))
+    agent.train()
+
+
 def shared_parameter_twice() -> None:
     """Actor and critic share layers, and the optimizer has both lists of parameters."""
     agent = Agent()
@@ -308,6 +325,7 @@ MISTAKES: list[Callable[[], None]] = [
     parameter_without_optimizer, optimizer_of_another_agent, frozen_parameter_in_the_optimizer, two_critics,
     two_owners_of_gamma, two_owners_of_gamma_in_the_replay, two_owners_of_lambda, a_loss_a_row, no_loss_entry,
     own_loss_that_broadcasts, flattened_rollout, advantage_of_the_actor, critic_of_two_values, shared_parameter_twice,
+    advantage_with_a_gradient, critics_of_states,
 ]  # fmt: skip
 
 
