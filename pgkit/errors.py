@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from numbers import Integral
 from typing import Any
 
 
@@ -15,7 +16,7 @@ class UserError(ValueError):
 def whole(least: int, **settings: Any) -> None:
     """Raises ``UserError`` for a setting that is no whole number, or below ``least``; None passes."""
     for name, value in settings.items():
-        if value is not None and (not isinstance(value, int) or value < least):
+        if value is not None and (not isinstance(value, Integral) or value < least):
             raise UserError(f"{name}={value!r}: give a whole number, at least {least}")
 
 

@@ -60,7 +60,7 @@ class Args(run.RunArgs):
     asynchronous: bool = False
     """Collect in another process while this one updates: rollouts are one update old, see train/policy_lag."""
     random_frames: int = 1_000
-    """Frames with random actions at the start; updates begin after them."""
+    """Frames with random actions before updates begin; a run no longer than that has a batch of them."""
     batch_size: int = 256
     """Rows of a batch."""
     updates_per_step: float = 1.0
@@ -151,6 +151,7 @@ def main(args: Args) -> None:
     with run.Run(args, recipe=args.variant or "sac") as log:
         make_env = partial(envs.make, args.env_id, action_repeat=args.action_repeat)
         env = make_env(num_envs=args.num_envs, seed=args.seed, workers=args.workers)
+        random_frames = args.random_frames if args.random_frames < args.total_frames else args.batch_size
         actor, critics, normalizer = networks(args, env)
         if args.alpha is not None:
             temperature = controllers.FixedTemperature(args.alpha)
@@ -177,7 +178,7 @@ def main(args: Args) -> None:
             updates_per_step=args.updates_per_step,
             actor_delay=args.actor_delay,
             tau=args.tau,
-            learning_starts=max(args.random_frames, args.batch_size),
+            learning_starts=max(random_frames, args.batch_size),
             total_frames=args.total_frames,
             compile=args.compile,
         )
@@ -187,7 +188,7 @@ def main(args: Args) -> None:
             actor,
             frames_per_batch=args.num_envs * args.steps,
             total_frames=args.total_frames,
-            init_random_frames=args.random_frames,
+            init_random_frames=random_frames,
             compile=args.compile,
         )
 

@@ -3,6 +3,7 @@
 from functools import partial
 
 import gymnasium as gym
+import numpy as np
 import pytest
 import torch
 from torch import nn
@@ -24,6 +25,8 @@ STORED = ENV.rollout(4).exclude("action_log_prob")
     [
         (lambda: PPO(ADAM, epochs=0), "epochs=0: give a whole number, at least 1"),
         (lambda: PPO(ADAM, minibatch_size=32.0), "minibatch_size=32.0: give a whole number"),
+        (lambda: PPO(ADAM, epochs=np.int64(0)), "epochs=.*0.*: give a whole number, at least 1"),
+        (lambda: modules.discrete_q_value(envs.make("CartPole-v1"), 0), "num_critics=0"),
         (lambda: PPO(ADAM, target_kl=-1), "target_kl=-1: give a number that is at least 0"),
         (lambda: PPO(ADAM, compile=False), "compile is 'auto', 'on' or 'off', not False"),
         (lambda: PPO([ADAM, ADAM]), "several optimizers are one block: updates.Together"),
@@ -71,7 +74,7 @@ def test_a_wrong_argument_is_named(call, message):
 
 
 def test_bounds_are_inclusive_and_none_passes():
-    whole(1, a=1, b=None)
+    whole(1, a=1, b=None, c=np.int64(2))
     within(0, 1, a=0, b=1.0, c=torch.tensor(0.5), d=None)
     for low, high, value in ((0, 1, 1.01), (0, 1, float("nan")), (1, float("inf"), 0.5)):
         with pytest.raises(UserError, match="^a="):

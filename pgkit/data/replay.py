@@ -54,7 +54,7 @@ class ReplayBuffer:
     ) -> None:
         if not isinstance(env, EnvBase):
             raise UserError(f"ReplayBuffer(env, capacity): env is a {type(env).__name__}, give what envs.make gives")
-        if not (sampler is None or isinstance(sampler, Prioritized)):
+        if sampler is not None and (isinstance(sampler, type) or not hasattr(sampler, "write_back")):
             raise UserError(f"sampler={sampler!r}: give data.Prioritized(), or None to draw uniformly")
         whole(1, capacity=capacity, n_steps=n_steps, final_rows=final_rows)
         self.columns = env.batch_size.numel()

@@ -57,12 +57,12 @@ def make(
             f"num_envs={num_envs}, workers={workers}: every worker needs at least one environment; "
             "choose 1 <= workers <= num_envs"
         )
-    if isinstance(env_id, str) and not env_id.startswith(("dm_control/", "dmc:")):
-        make_env = partial(make_one, env_id, max_episode_steps=max_episode_steps, **kwargs)
-    else:
-        make_env = partial(*((make_one, env_id) if isinstance(env_id, str) else (env_id,)), **kwargs)
-        if max_episode_steps is not None:
-            make_env = partial(_limit, make_env, max_episode_steps)
+    limited = isinstance(env_id, str) and not env_id.startswith(("dm_control/", "dmc:"))  # by Gymnasium
+    if limited and max_episode_steps is not None:
+        kwargs["max_episode_steps"] = max_episode_steps
+    make_env = partial(make_one, env_id, **kwargs) if isinstance(env_id, str) else partial(env_id, **kwargs)
+    if max_episode_steps is not None and not limited:
+        make_env = partial(_limit, make_env, max_episode_steps)
     if action_repeat > 1:
         make_env = partial(_repeat, make_env, action_repeat)
     env = VectorEnv(make_env, num_envs, seed, workers, flatten)

@@ -52,7 +52,6 @@ def q_value(
         encoder: one module from the observation, or from the entries that its attribute ``in_keys`` names
             (:func:`~pgkit.modules.dict_encoder`), to the features that all critics read beside the action.
     """
-    whole(1, num_critics=num_critics)
     inputs, features = trunk(env, (), activation, normalizer, encoder)
     layers, last = _layers(num_critics, features + action_size(env), hidden, activation, norm, dropout, body)
     layers.append(EnsembleLinear(num_critics, last, 1 if head is None else head.size, gain=1.0))
@@ -104,6 +103,7 @@ def _layers(
     dropout: float,
     body: Body | None,
 ) -> Layers:
+    whole(1, num_critics=num)
     if body is not None:
         return body(num, features)
     return ensemble_mlp(num, features, hidden, activation, norm, dropout)

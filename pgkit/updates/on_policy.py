@@ -19,6 +19,7 @@ from pgkit.functional import standardize
 from pgkit.updates import restoring, wiring
 from pgkit.updates.chain import Chain
 from pgkit.updates.diagram import diagram
+from pgkit.updates.entries import another_policy
 from pgkit.updates.optimizers import check_optimizer
 from pgkit.updates.recorded import Block, recorded_block
 from pgkit.updates.sequences import as_rows, check_one_memory, check_time
@@ -203,6 +204,9 @@ class OnPolicyUpdate:
         self._batch = flat[:size]
         check_one_memory(self.loss, self.advantage)
         names = wiring.check(self.loss, self.advantage, self.optimizer, self._batch)
+        reason = another_policy(Chain(self.loss, self.advantage), self._batch)
+        if reason and not self.frames:  # a resumed collector may have collected with older weights
+            getLogger("pgkit").warning(reason)
         per_rollout = self.epochs * -(-rows // size)
         steps = None if self.total_frames is None else self.total_frames / flat.numel() * per_rollout
         return GradientStep(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import fields
-from logging import getLogger
 from typing import Any
 
 import torch
@@ -67,8 +66,6 @@ def _trial(chain: Chain, optimizer: Optimizer, batch: TensorDictBase) -> list[st
     _check_result(chain, batch, out)
     if reason := entries.wrong_action(chain, batch):
         raise UserError(reason)
-    if reason := entries.another_policy(chain, batch):
-        getLogger("pgkit").warning(reason)
     total = torch.stack([out[key].sum() for key in out.keys() if is_loss(key)]).sum()
     owners.check_parameters(chain, optimizer, total)
     return [key for key in out.keys() if out[key].numel() == 1]

@@ -39,6 +39,11 @@ def test_resumed_without_its_buffer_it_says_so_and_goes_on(tmp_path, caplog):
     assert int(rows(tmp_path / "run")[-1]["frames"]) >= 600
 
 
+def test_a_run_shorter_than_its_random_frames_trains(tmp_path):
+    train(tmp_path / "run", "--random-frames", 5000, frames=300)
+    assert rows(tmp_path / "run")[-1]["train/loss_qvalue"]
+
+
 @pytest.mark.parametrize(
     "flags",
     [
