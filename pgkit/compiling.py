@@ -18,11 +18,12 @@ from torch.fx.subgraph_rewriter import replace_pattern
 
 from pgkit.errors import UserError
 
-# the same random numbers as eager code; tensors referred to, never copied into the code as numbers
+# the same random numbers as eager code
 _OPTIONS: dict[str, Any] = {
     "fallback_random": True,
-    "always_keep_tensor_constants": True,
     "reorder_for_locality": False,
+    "size_asserts": False,
+    "alignment_asserts": False,
 }
 # sums over a few action dimensions as loops, which are vectorized: written out, every row takes scalar code;
 # C++ around the kernels: Python there costs a small step a quarter of its time
@@ -133,12 +134,11 @@ def compile_record(graph: GraphModule, inputs: Sequence[Tensor]) -> Callable[...
     """Inductor's code for a recorded graph. It checks nothing: call it with tensors like ``inputs`` and no others."""
     from torch._inductor.compile_fx import compile_fx, compile_fx_inner  # 4 seconds, for those who compile
 
-    options = {**_OPTIONS, "size_asserts": False, "alignment_asserts": False}
     (results,) = graph.graph.output_node().args
     constants = _as_inputs(graph)
-    tensors = [*inputs, *constants]
+    tensors, options = [*inputs, *constants], _OPTIONS
     if all(x.device.type == "cpu" for x in tensors):
-        options |= _CPU_OPTIONS
+        options = _OPTIONS | _CPU_OPTIONS
         _batch_products(graph)
         for node in graph.graph.nodes:
             node.meta.clear()  # the C++ wrapper refuses values of the recording's own mode
@@ -150,7 +150,7 @@ def compile_record(graph: GraphModule, inputs: Sequence[Tensor]) -> Callable[...
 
     with torch.no_grad():
         code = compile_fx(graph, tensors, inner_compile=compile_kernels, config_patches=options)
-    # what is around the kernels takes views and aliases apart: nothing to do where they take and give what the graph does
+    # around the kernels, aliases are taken apart: nothing to do where they take and give what the graph does
     if len(kernels) == 1:
         taken, compiled = kernels[0]
         if taken == len(tensors) and len(compiled.output_strides or ()) == len(cast(Any, results)):
@@ -183,7 +183,8 @@ def _batch_products(graph: GraphModule) -> None:
     def product(x: Tensor, y: Tensor) -> Tensor:
         return aten.squeeze.dim(aten.bmm.default(aten.unsqueeze.default(x, 0), aten.unsqueeze.default(y, 0)), 0)
 
+    def biased(bias: Tensor, x: Tensor, y: Tensor) -> Tensor:
+        return aten.add.Tensor(product(x, y), bias)
+
     replace_pattern(graph, lambda x, y: aten.mm.default(x, y), product)
-    replace_pattern(
-        graph, lambda bias, x, y: aten.addmm.default(bias, x, y), lambda bias, x, y: aten.add.Tensor(product(x, y), bias)
-    )
+    replace_pattern(graph, lambda bias, x, y: aten.addmm.default(bias, x, y), biased)

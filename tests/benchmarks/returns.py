@@ -1,15 +1,16 @@
-"""Returns of finished runs, experiment by experiment: a table by frames, and a figure by minutes.
+"""Returns of finished runs by frames and by minutes, in a table that grows run by run.
 
-    python tests/benchmarks/returns.py --runs RUN_DIR ... --speed RUN_DIR ... --out returns.png
+    python tests/benchmarks/returns.py add docs/pages/data/critics.csv "layer norm" RUN_DIR ... --speed RUN_DIR
+    python tests/benchmarks/returns.py draw docs/pages/data/critics.csv docs/pages/images/critics.png
 
-Runs that differ in nothing but their seed are one experiment. The interquartile mean weighs the middle half of the
-seeds; its interval is the 95% bootstrap over seeds (Agarwal et al., 2021, https://arxiv.org/abs/2108.13264). Minutes
-are frames by the speed of a short run of the same experiment, alone on the machine: `--speed` has one of each.
+The first command adds the evaluations of runs that differ in nothing but their seed; ``--speed`` is a short run with
+the same settings, alone on the machine: minutes are frames by its speed. The second prints the last returns and draws
+the curves. The interquartile mean weighs the middle half of the seeds; its interval is the 95% bootstrap over seeds
+(Agarwal et al., 2021, https://arxiv.org/abs/2108.13264).
 """
 
-import itertools
+import csv
 import json
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -18,19 +19,66 @@ from matplotlib.figure import Figure
 
 from pgkit.run.directory import read_config
 from pgkit.run.metrics import column, read_csv
-from pgkit.run.plots import EVALUATION, labels, mean_and_band
+from pgkit.run.plots import EVALUATION
+
+COLUMNS = ("experiment", "seed", "frames_per_second", "frames", "return")
 
 
-@dataclass
-class Options:
-    """What to compare."""
+def read(table: Path) -> list[dict[str, str]]:
+    """Rows of a table that :func:`add` wrote; none where there is no such file."""
+    if not table.exists():
+        return []
+    with table.open(newline="") as file:
+        return list(csv.DictReader(file))
 
-    runs: list[Path]
-    """Finished runs."""
-    speed: list[Path]
-    """A short run of each experiment."""
-    out: Path = Path("returns.png")
-    """The figure."""
+
+def add(table: Path, experiment: str, runs: tyro.conf.Positional[tuple[Path, ...]] = (), /, speed: Path | None = None):
+    """Adds runs of one experiment, in place of those with the same seeds.
+
+    Args:
+        table: a CSV file, made where there is none.
+        experiment: its name in the figure.
+        runs: run directories.
+        speed: a short run, for the speed of the whole experiment.
+    """
+    curves = {str(read_config(run)["seed"]): column(read_csv(run / "metrics.csv")[1], EVALUATION) for run in runs}
+    rows = [row for row in read(table) if row["experiment"] != experiment or row["seed"] not in curves]
+    for seed, curve in curves.items():
+        rows += [
+            dict(zip(COLUMNS, (experiment, seed, "", int(frames), round(value, 1)), strict=True))
+            for frames, value in curve
+        ]
+    if speed is not None:
+        rate = json.loads((speed / "summary.json").read_text())["time/fps"]
+        rows = [row | {"frames_per_second": round(rate, 1)} if row["experiment"] == experiment else row for row in rows]
+    with table.open("w", newline="") as file:
+        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def draw(table: Path, figure: Path, /) -> None:
+    """Prints the last return of every seed, and draws mean returns against minutes."""
+    rows = read(table)
+    drawing = Figure(figsize=(7, 5), layout="constrained")
+    axes = drawing.subplots()
+    print("| experiment | last return of each seed | interquartile mean | its 95% interval | frames/s | minutes |")
+    print("|---|---|---|---|---|---|")
+    for name in dict.fromkeys(row["experiment"] for row in rows):
+        own = [row for row in rows if row["experiment"] == name]
+        frames = sorted({int(row["frames"]) for row in own})
+        returns = [np.array([float(row["return"]) for row in own if int(row["frames"]) == count]) for count in frames]
+        speed, last = float(own[0]["frames_per_second"]), returns[-1]
+        minutes, (low, high) = np.array(frames) / speed / 60, interval(last)
+        print(
+            f"| {name} | {' '.join(f'{value:,.0f}' for value in last)} | {interquartile_mean(last):,.0f} "
+            f"| {low:,.0f} to {high:,.0f} | {speed:.0f} | {minutes[-1]:.0f} |"
+        )
+        axes.plot(minutes, [some.mean() for some in returns], marker="o", label=f"{name} ({len(last)})")
+    axes.set(xlabel="minutes", ylabel="return of an evaluation, mean over seeds")
+    axes.grid(alpha=0.3)
+    drawing.legend(loc="outside lower center", fontsize="small", frameon=False, ncols=2)
+    drawing.savefig(figure, dpi=150)
 
 
 def interquartile_mean(scores: np.ndarray) -> np.ndarray:
@@ -48,33 +96,5 @@ def interval(scores: np.ndarray, draws: int = 10_000) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def main(options: Options) -> None:
-    """Prints the table, writes the figure."""
-    names = labels({path: read_config(path) for path in [*options.runs, *options.speed]})
-    speeds = {names[path]: json.loads((path / "summary.json").read_text())["time/fps"] for path in options.speed}
-    figure = Figure(figsize=(7, 5), layout="constrained")
-    axes = figure.subplots()
-    print("| experiment | return of each seed | interquartile mean | 95% | frames/s | minutes |")
-    print("|---|---|---|---|---|---|")
-    for name, group in itertools.groupby(
-        sorted(options.runs, key=lambda path: names[path]), key=lambda path: names[path]
-    ):
-        curves = [column(read_csv(path / "metrics.csv")[1], EVALUATION) for path in group]
-        last = np.array([curve[-1][1] for curve in curves])
-        low, high = interval(last)
-        minutes = curves[0][-1][0] / speeds[name] / 60
-        seeds = " ".join(f"{value:,.0f}" for value in last)
-        print(
-            f"| {name} | {seeds} | {interquartile_mean(last):,.0f} | {low:,.0f} to {high:,.0f} "
-            f"| {speeds[name]:.0f} | {minutes:.0f} |"
-        )
-        frames, mean, _ = mean_and_band(curves)
-        axes.plot(frames / speeds[name] / 60, mean, marker="o", label=f"{name} ({len(last)})")
-    axes.set(xlabel="minutes", ylabel="return of an evaluation, mean over seeds")
-    axes.grid(alpha=0.3)
-    figure.legend(loc="outside lower center", fontsize="small", frameon=False)
-    figure.savefig(options.out, dpi=150)
-
-
 if __name__ == "__main__":
-    main(tyro.cli(Options))
+    tyro.extras.subcommand_cli_from_dict({"add": add, "draw": draw})

@@ -1,0 +1,39 @@
+"""A recorded and compiled function repeats the function, whatever its inputs and results share."""
+
+import pytest
+import torch
+
+from pgkit.compiling import compile_record, record
+
+BIAS = torch.arange(4.0)
+WEIGHT = torch.nn.Parameter(torch.linspace(-1, 1, 12).reshape(3, 4))
+
+
+def products(x, y):
+    """Of both kinds, with tensors that are no inputs."""
+    return [torch.addmm(BIAS, x, WEIGHT), y.mm(WEIGHT).sin(), torch.addmm(BIAS, x, WEIGHT, beta=2.0)]
+
+
+def changes_an_input(x, y):
+    x.add_(y.mm(WEIGHT).mean())
+    return [x.sum()]
+
+
+def gives_its_inputs(x, y):
+    """One as it is, a view of the other."""
+    return [x, y.view(-1), x * 2]
+
+
+@pytest.mark.parametrize("function", [products, changes_an_input, gives_its_inputs])
+@pytest.mark.parametrize("second", [slice(3, 6), slice(0, 3), slice(1, 4)], ids=["apart", "twice", "overlapping"])
+@torch.no_grad()
+def test_compiled_code_repeats_the_function(function, second):
+    def inputs(seed):
+        x = torch.randn(6, 3, generator=torch.Generator().manual_seed(seed))
+        return [x[:3], x[second]]
+
+    compiled = compile_record(record(function, inputs(0)), inputs(0))
+    for seed in (0, 1):
+        ours, its = inputs(seed), inputs(seed)
+        torch.testing.assert_close(list(compiled(*ours)), function(*its))
+        torch.testing.assert_close(ours, its)
