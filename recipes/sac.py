@@ -84,7 +84,7 @@ class Args(run.RunArgs):
     alpha_init: float = 1.0
     """The trained temperature at the start."""
     target_entropy: float | None = None
-    """Entropy that the temperature holds; None is minus the number of action dimensions."""
+    """Entropy that the temperature holds, of actions scaled to [-1, 1]; None is minus the number of dimensions."""
     buffer_size: int = 1_000_000
     """Frames that the replay buffer keeps."""
     buffer_dir: Path | None = None
@@ -156,9 +156,10 @@ def main(args: Args) -> None:
         if args.alpha is not None:
             temperature = controllers.FixedTemperature(args.alpha)
         else:
-            dimensions = env.action_spec_unbatched.shape.numel()
-            target_entropy = -dimensions if args.target_entropy is None else args.target_entropy
-            temperature = controllers.Temperature(target_entropy, args.alpha_init)
+            spec = env.action_spec_unbatched
+            unit = ((spec.space.high - spec.space.low) / 2).log().sum().item()  # of actions' densities, against [-1, 1]
+            target_entropy = -spec.shape.numel() if args.target_entropy is None else args.target_entropy
+            temperature = controllers.Temperature(target_entropy + unit, args.alpha_init)
 
         sampler = data.Prioritized() if args.replay == "prioritized" else None
         storage = data.in_files(args.buffer_dir) if args.buffer_dir else LazyTensorStorage

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import nn
 
-from pgkit import advantages, collectors, data, envs, losses, modules, updates
+from pgkit import advantages, collectors, controllers, data, envs, losses, modules, updates
 from pgkit.errors import UserError, whole, within
 
 ENV = envs.make("Pendulum-v1")
@@ -44,6 +44,8 @@ STORED = ENV.rollout(4).exclude("action_log_prob")
         (lambda: advantages.GAE(nn.Linear(3, 1)), "takes a TensorDict module as critic, this is a Linear"),
         (lambda: SAC(gamma=2), "gamma=2: give a number from 0 to 1"),
         (lambda: SAC(temperature=0.2), r"temperature=0.2: give a block .*controllers.FixedTemperature"),
+        (lambda: SAC(alpha_init=0), "alpha_init=0: give a number above 0"),
+        (lambda: controllers.Temperature(-1, 0), "alpha_init=0: give a number above 0"),
         (lambda: losses.ClipPPOLoss(ACTOR, clip_epsilon=-0.2), "clip_epsilon=-0.2: give a number"),
         (lambda: data.Prioritized(alpha=-5), "alpha=-5: give a number"),
         (lambda: data.ReplayBuffer(1000), "env is a int, give what envs.make gives"),

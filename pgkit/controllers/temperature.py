@@ -7,6 +7,7 @@ from math import log
 import torch
 from torch import Tensor, nn
 
+from pgkit.errors import UserError
 from pgkit.functional import temperature_loss
 
 
@@ -17,8 +18,9 @@ class Temperature(nn.Module):
     these two does as well: ``alpha`` (a detached scalar) and ``loss(log_prob [*B]) -> [*B]``.
 
     Args:
-        target_entropy: :math:`\bar H` in nats; by custom minus the number of action dimensions.
-        alpha_init: its value at the start.
+        target_entropy: :math:`\bar H` in nats; by custom minus the number of action dimensions, for actions in [-1, 1]:
+            add the log of half the range of each dimension for others.
+        alpha_init: its value at the start, above 0.
         min_alpha, max_alpha: bounds of :math:`\alpha`; None: none.
     """
 
@@ -31,6 +33,8 @@ class Temperature(nn.Module):
         max_alpha: float | None = None,
     ) -> None:
         super().__init__()
+        if alpha_init <= 0:
+            raise UserError(f"alpha_init={alpha_init:g}: give a number above 0 (FixedTemperature(0) for none)")
         self.target_entropy = float(target_entropy)
         self.bounds = (log(min_alpha) if min_alpha else None, log(max_alpha) if max_alpha else None)
         self.log_alpha = nn.Parameter(torch.tensor(log(alpha_init)))

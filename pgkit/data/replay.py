@@ -246,7 +246,7 @@ class ReplayBuffer:
 
 def _differ(x: Tensor, y: Tensor) -> Tensor:
     """Which rows ``[rows, *shape]`` differ, ``[rows]``."""
-    return (x != y).reshape(len(x), -1).any(-1)
+    return (x != y).unsqueeze(-1).flatten(1).any(-1)
 
 
 def _write(table: Tensor, rows: int, frame: int, x: Tensor) -> None:

@@ -84,6 +84,8 @@ class SoftQLoss(QLoss):
         values = {"min": twin_minimum, "mean": ensemble_mean}
         if actor_value not in values:
             raise UserError(f"actor_value={actor_value!r}: give 'min' or 'mean'")
+        if alpha_init <= 0:
+            raise UserError(f"alpha_init={alpha_init:g}: give a number above 0")
         self.subset, self.actor_value = subset, values[actor_value]
         self.temperature: Any = temperature
         if temperature is None:

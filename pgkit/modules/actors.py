@@ -70,8 +70,12 @@ def tanh_normal_actor(
     """
     space: Any = box_action(env, needs_bounds=True).space
     layers, features = trunk(env, hidden, activation, normalizer, encoder)
-    head = StateDependentHead(features, action_size(env), log_std_bounds)
-    kwargs = {"low": space.low, "high": space.high, "tanh_loc": tanh_loc, "event_dims": 1}
+    head = StateDependentHead(features, action_size(env), log_std_bounds, loc_bound=5.0 if tanh_loc else None)
+    kwargs = {
+        "low": space.low,
+        "high": space.high,
+        "event_dims": 1,
+    }  # its own tanh_loc moves the mean by the bounds' middle
     return probabilistic(headed(layers, head, ["loc", "scale"]), ["loc", "scale"], TanhNormal, kwargs)
 
 
@@ -118,15 +122,18 @@ class GaussianHead(nn.Module):
 
 
 class StateDependentHead(nn.Module):
-    """Linear mean and log standard deviation, the latter within bounds: ``[*B, features] -> 2 x [*B, actions]``."""
+    """Linear mean and log standard deviation within bounds: ``[*B, features] -> 2 x [*B, actions]``."""
 
-    def __init__(self, features: int, actions: int, log_std_bounds: tuple[float, float]) -> None:
+    def __init__(
+        self, features: int, actions: int, log_std_bounds: tuple[float, float], loc_bound: float | None = None
+    ) -> None:
         super().__init__()
         self.linear = nn.Linear(features, 2 * actions)
-        self.low, self.high = log_std_bounds
+        (self.low, self.high), self.loc_bound = log_std_bounds, loc_bound
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
         loc, raw = self.linear(x).chunk(2, -1)
+        loc = loc if self.loc_bound is None else self.loc_bound * (loc / self.loc_bound).tanh()
         return loc, (self.low + 0.5 * (self.high - self.low) * (raw.tanh() + 1)).exp()
 
 

@@ -34,6 +34,8 @@ def trunk(
         )
     else:
         examples = [_zero(env, encoder, key) for key in reads(encoder)]
+        modes = {module: module.training for module in encoder.modules()}
+        encoder.eval()  # a batch of zeros is no statistic
         try:
             with torch.no_grad():
                 features = first(encoder(*examples)).shape[-1]
@@ -42,6 +44,9 @@ def trunk(
             raise UserError(
                 f"encoder={type(encoder).__name__} cannot take an observation {found}: {str(error).splitlines()[0]}"
             ) from error
+        finally:
+            for module, training in modes.items():
+                module.training = training
     return [encoder] if normalizer is None else [normalizer, encoder], features
 
 

@@ -108,7 +108,15 @@ class OffPolicyUpdate:
         self._batches.extend(rollout)
         self.frames += rollout.numel()
         stored = self.buffer.written if isinstance(self.buffer, ReplayBuffer) else len(self.buffer)
-        if stored < self.learning_starts or len(self.buffer) < self.batch_size:
+        if stored < self.learning_starts:
+            return {}
+        if len(self.buffer) < self.batch_size:
+            if isinstance(self.buffer, ReplayBuffer) and self.buffer.start > 0:
+                raise UserError(
+                    f"batch_size={self.batch_size} is above the {len(self.buffer)} frames that the replay keeps of "
+                    f"{stored:,}: episodes end too often for its {self.buffer.final_rows} final observations; raise "
+                    "its capacity (--buffer-size) or ReplayBuffer(final_rows=...)"
+                )
             return {}
         self._due += rollout.numel() * self.updates_per_step
         count = int(self._due)

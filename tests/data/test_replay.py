@@ -119,6 +119,15 @@ def test_of_a_rollout_longer_than_the_capacity_the_end_is_kept():
         assert kept(buffer)["next", "observation"][:, 0].tolist() == [7, 8, 9, 10]
 
 
+@pytest.mark.parametrize("num_envs", [1, 8])
+def test_of_a_rollout_the_last_step_is_kept_where_there_is_room_for_one(num_envs):
+    env = envs.make("Pendulum-v1", num_envs)
+    buffer = data.ReplayBuffer(env, num_envs)
+    for rollout in rollouts(env, 5, 2):
+        buffer.extend(rollout)
+    assert torch.equal(kept(buffer)["next", "observation"], rollout["next", "observation"][:, -1])
+
+
 def test_too_many_endings_evict_the_oldest_frames_and_none_is_wrong():
     buffer = data.ReplayBuffer(envs.make("Pendulum-v1"), 64, final_rows=4)
     for start in range(0, 60, 3):

@@ -89,6 +89,30 @@ def test_a_saturated_squashed_action_can_be_scored_again_if_the_mean_is_bounded(
     assert (again - out["action_log_prob"]).abs().min() > 10  # the trap itself
 
 
+@pytest.mark.parametrize("tanh_loc", [False, True])
+def test_a_squashed_action_reaches_both_ends_of_its_range(tanh_loc):
+    class Positive(gym.Env):
+        observation_space, action_space = gym.spaces.Box(-1, 1, (3,)), gym.spaces.Box(0, 10, (1,))
+
+    env = envs.VectorEnv(Positive)
+    actor = modules.tanh_normal_actor(env, tanh_loc=tanh_loc)
+    bias, ends = actor.get_parameter("module.0.module.1.linear.bias"), []
+    for loc in (-1e3, 0.0, 1e3):
+        with torch.no_grad():
+            bias[0] = loc
+            ends.append(actor.get_dist(env.observation_spec.zero()).deterministic_sample.item())
+    assert ends == pytest.approx([0.0, 5.0, 10.0], abs=0.3)
+
+
+@pytest.mark.parametrize("builder", [modules.state_value, modules.q_value, modules.gaussian_actor])
+def test_building_with_an_encoder_leaves_its_statistics_alone(builder):
+    env = envs.make("Pendulum-v1")
+    encoder = nn.Sequential(nn.Linear(3, 5), nn.BatchNorm1d(5), nn.Dropout().eval())
+    builder(env, encoder=encoder)
+    assert encoder[1].num_batches_tracked == 0
+    assert [module.training for module in encoder] == [True, True, False]
+
+
 @pytest.mark.parametrize("make", [modules.gaussian_actor, modules.tanh_normal_actor, modules.deterministic_actor])
 def test_actions_that_are_no_vector_are_refused(make):
     class Matrix(gym.Env):

@@ -317,29 +317,65 @@ def test_priorities_under_another_key_and_a_loss_without_any():
         )(rollout)
 
 
-def test_short_episodes_delay_no_update():
-    """Of episodes of one step the replay keeps an eighth of its capacity, less than learning_starts."""
+class Bandit(gym.Env):
+    observation_space = action_space = gym.spaces.Box(-1, 1, (1,))
 
-    class Bandit(gym.Env):
-        observation_space = action_space = gym.spaces.Box(-1, 1, (1,))
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.np_random.uniform(-1, 1, 1).astype("f4"), {}
 
-        def reset(self, *, seed=None, options=None):
-            super().reset(seed=seed)
-            return self.np_random.uniform(-1, 1, 1).astype("f4"), {}
+    def step(self, action):
+        return self.reset()[0], 1.0, True, False, {}
 
-        def step(self, action):
-            return self.reset()[0], 1.0, True, False, {}
 
+def trained_on_episodes_of_one_step(batch_size):
     env = envs.make(Bandit, num_envs=2, seed=1)
     actor = modules.tanh_normal_actor(env, (8,))
     loss = losses.SACLoss(actor, modules.q_value(env, 2, (8,)))
     update = updates.OffPolicyUpdate(
-        loss, data.ReplayBuffer(env, 400), torch.optim.Adam(loss.parameters()), batch_size=16, learning_starts=100,
-        updates_per_step=0.25, compile="off",
+        loss, data.ReplayBuffer(env, 400), torch.optim.Adam(loss.parameters()), batch_size=batch_size,
+        learning_starts=100, updates_per_step=0.25, compile="off",
     )  # fmt: skip
     for rollout in collectors.VectorCollector(env, actor, frames_per_batch=20, total_frames=400, compile="off"):
         update(rollout)
+    return update
+
+
+def test_short_episodes_delay_no_update():
+    """Of episodes of one step the replay keeps an eighth of its capacity, less than learning_starts."""
+    update = trained_on_episodes_of_one_step(batch_size=16)
     assert len(update.buffer) < 100 and update.updates == (400 - 80) / 4
+
+
+def test_a_replay_that_never_has_a_batch_is_said():
+    with pytest.raises(
+        UserError, match=r"batch_size=64 is above the \d+ frames that the replay keeps of 100: .*final_rows"
+    ):
+        trained_on_episodes_of_one_step(batch_size=64)
+
+
+@pytest.mark.parametrize("own", [True, False], ids=["pgkit's replay", "TorchRL's"])
+def test_a_number_taken_outside_torch_is_not_kept_in_the_compiled_step(own):
+    class Scaled(losses.SACLoss):
+        def forward(self, batch):
+            out = super().forward(batch)
+            return out.set("loss_qvalue", out["loss_qvalue"] * float(batch["next", "reward"].numpy().std()))
+
+    results = []
+    for compile in ("on", "off"):
+        torch.manual_seed(0)
+        env = envs.make("Pendulum-v1")
+        actor = modules.tanh_normal_actor(env, (8,))
+        loss = Scaled(actor, modules.q_value(env, 2, (8,)))
+        theirs = TensorDictReplayBuffer(storage=LazyTensorStorage(500), batch_size=32)
+        update = updates.OffPolicyUpdate(
+            loss, data.ReplayBuffer(env, 500, seed=0) if own else theirs, torch.optim.Adam(loss.parameters(), lr=0.0),
+            batch_size=32, learning_starts=64, updates_per_step=0.05, compile="auto" if compile == "on" else "off",
+        )  # fmt: skip
+        collector = collectors.VectorCollector(env, actor, frames_per_batch=32)
+        torch.manual_seed(1)
+        results.append([update(collector.rollout()).get("loss_qvalue") for _ in range(5)][1:])
+    assert results[0] == pytest.approx(results[1], rel=1e-4)
 
 
 def test_torchrl_s_n_step_returns_of_several_environments_are_refused():
