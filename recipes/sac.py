@@ -156,7 +156,7 @@ def main(args: Args) -> None:
         if args.alpha is not None:
             temperature = controllers.FixedTemperature(args.alpha)
         else:
-            spec = env.action_spec_unbatched
+            spec: Any = env.action_spec_unbatched
             unit = ((spec.space.high - spec.space.low) / 2).log().sum().item()  # of actions' densities, against [-1, 1]
             target_entropy = -spec.shape.numel() if args.target_entropy is None else args.target_entropy
             temperature = controllers.Temperature(target_entropy + unit, args.alpha_init)

@@ -9,6 +9,8 @@ import torch
 from torch import nn
 
 from pgkit import advantages, collectors, controllers, data, envs, losses, modules, updates
+from pgkit.envs.layout import layout
+from pgkit.envs.vector import action_spec
 from pgkit.errors import UserError, whole, within
 
 ENV = envs.make("Pendulum-v1")
@@ -17,6 +19,15 @@ ADAM = torch.optim.Adam([*ACTOR.parameters(), *CRITIC.parameters()])
 PPO = partial(updates.OnPolicyUpdate, losses.ClipPPOLoss(ACTOR, CRITIC), advantages.GAE(CRITIC))
 SAC = partial(losses.SACLoss, modules.tanh_normal_actor(ENV, (8,)), modules.q_value(ENV, 2, (8,)))
 REPLAYED = partial(updates.OffPolicyUpdate, SAC(), data.ReplayBuffer(ENV, 2000), ADAM)
+
+
+class WithANumber(nn.Module):
+    alpha = 0.2
+
+    def loss(self, log_prob):
+        return log_prob
+
+
 STORED = ENV.rollout(4).exclude("action_log_prob")
 
 
@@ -44,6 +55,15 @@ STORED = ENV.rollout(4).exclude("action_log_prob")
         (lambda: advantages.GAE(nn.Linear(3, 1)), "takes a TensorDict module as critic, this is a Linear"),
         (lambda: SAC(gamma=2), "gamma=2: give a number from 0 to 1"),
         (lambda: SAC(temperature=0.2), r"temperature=0.2: give a block .*controllers.FixedTemperature"),
+        (lambda: envs.make("Pendulum-v1", seed=-1), "seed=-1: give a whole number, at least 0"),
+        (lambda: envs.make("Pendulum-v1", action_repeat=0), "action_repeat=0: give a whole number, at least 1"),
+        (lambda: action_spec(gym.spaces.MultiBinary([2, 3]), 1), r"has shape \(2, 3\), actions are vectors: flatten"),
+        (lambda: action_spec(gym.spaces.MultiDiscrete([[2, 3], [4, 5]]), 1), r"has shape \(2, 2\), actions are"),
+        (
+            lambda: layout(gym.spaces.Dict(step_count=gym.spaces.Discrete(2))),
+            "'step_count' has a name that rollouts us",
+        ),
+        (lambda: SAC(temperature=WithANumber()), "WithANumber.alpha is 0.2: make it a tensor of one number"),
         (lambda: SAC(alpha_init=0), "alpha_init=0: give a number above 0"),
         (lambda: controllers.Temperature(-1, 0), "alpha_init=0: give a number above 0"),
         (lambda: losses.ClipPPOLoss(ACTOR, clip_epsilon=-0.2), "clip_epsilon=-0.2: give a number"),

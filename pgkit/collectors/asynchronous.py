@@ -107,7 +107,7 @@ class AsyncCollector:
         self.frames += self.frames_per_batch
         self._order(group)
         self._updates += 1
-        return as_rollout(arrays, self.env.split)
+        return as_rollout(arrays, self.env)
 
     def state_dict(self) -> dict[str, Any]:
         """Counters, rollouts that are collected but not handed out yet, and every environment's state."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from logging import getLogger
 from typing import Any
 
 import torch
@@ -10,6 +11,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
+from torch.overrides import TorchFunctionMode
 from torchrl.data import MultiCategorical, TensorSpec
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
@@ -56,8 +58,8 @@ def trace(
     It is the actor's own sequence of tensor operations, recorded once (``make_fx``) and called without TensorDict:
     the same numbers bit for bit, at about a quarter of the cost for a small network. ``compile`` hands the record to
     inductor, which halves that again and rounds differently in the last bits. Parameters and buffers are referred to,
-    not copied, so weights changed in place take effect. An actor that cannot be recorded (Python control flow that
-    depends on data) is called as it is.
+    not copied, so weights changed in place take effect; plain attributes are fixed. An actor that cannot be recorded
+    (Python control flow that depends on data, numpy) is called as it is.
     """
     keys = output_keys(actor)
 
@@ -71,14 +73,39 @@ def trace(
 
     with torch.no_grad(), torch.random.fork_rng(devices=[]), set_exploration_type(ExplorationType.RANDOM):
         try:
-            graph = record(act, inputs)
+            with _LeavesTorch() as leaves:
+                graph = record(act, inputs)
         except RuntimeError as error:
             if "proxy" not in str(error) and "trac" not in str(error):
                 raise
             return act
-        if not compile:
-            return graph.forward
-        return compile_record(graph, inputs)
+        if leaves.seen or not _repeats(graph.forward, act, inputs):
+            getLogger("pgkit").info("the policy computes outside torch: it is called as it is, several times slower")
+            return act
+        return compile_record(graph, inputs) if compile else graph.forward
+
+
+class _LeavesTorch(TorchFunctionMode):
+    """Notices tensors that become numpy arrays or lists: what is computed from those is a constant of a record."""
+
+    seen = False
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        self.seen |= func in (Tensor.numpy, Tensor.tolist, Tensor.__array__)
+        return func(*args, **(kwargs or {}))
+
+
+def _repeats(graph: Act, act: Act, inputs: Sequence[Tensor]) -> bool:
+    """Whether a recorded policy does on other observations what the policy does; Python's numbers are constants."""
+    obs, *state = inputs
+    for _ in range(3):
+        other = obs + 0.1 * torch.rand_like(obs)
+        random = torch.get_rng_state()
+        expected = act(other, *state)
+        torch.set_rng_state(random)
+        if not all(torch.allclose(x, y, equal_nan=True) for x, y in zip(graph(other, *state), expected, strict=True)):
+            return False
+    return True
 
 
 def random_actions(
@@ -104,13 +131,18 @@ def random_actions(
 
 def _allowed(spec: TensorSpec, mask: Tensor) -> Tensor:
     """Discrete actions drawn uniformly of those that a mask ``[N, choices]`` allows."""
-    several = isinstance(spec, MultiCategorical)
-    sizes = spec.nvec.reshape(-1, spec.shape[-1])[0].tolist() if several else [mask.shape[-1]]
     parts = []
-    for part in mask.split(sizes, -1):
+    for part in choices(spec, mask):
         possible = part | ~part.any(-1, keepdim=True)  # a worker's padding allows nothing, and is thrown away
         parts.append(torch.multinomial(possible.float(), 1))
-    return torch.cat(parts, -1) if several else parts[0].squeeze(-1)
+    return torch.cat(parts, -1) if isinstance(spec, MultiCategorical) else parts[0].squeeze(-1)
+
+
+def choices(spec: TensorSpec, mask: Tensor) -> Sequence[Tensor]:
+    """The parts of an action mask ``[*B, n]`` that belong to one choice each."""
+    if not isinstance(spec, MultiCategorical):
+        return [mask]
+    return mask.split(spec.nvec.reshape(-1, spec.shape[-1])[0].tolist(), -1)
 
 
 def check_env(env: Any, collector: Any) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,9 +11,8 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from pgkit.collectors.policy import STATE, Act
-from pgkit.envs import ArrayEnv
-from pgkit.envs.vector import whole
+from pgkit.collectors.policy import STATE, Act, choices
+from pgkit.envs import ArrayEnv, VectorEnv
 from pgkit.errors import UserError
 
 Arrays = dict[NestedKey, np.ndarray]
@@ -108,14 +107,14 @@ def _unchecked(entries: dict[Any, Any]) -> TensorDictBase:
     return TensorDict._new_unsafe(source=entries, batch_size=shape)
 
 
-def as_rollout(arrays: Arrays, split: Callable[[Tensor], dict[str, Tensor]] = whole) -> TensorDictBase:
+def as_rollout(arrays: Arrays, env: VectorEnv) -> TensorDictBase:
     """The arrays ``[T, N, ...]`` as a TensorDict ``[N, T]``, without a copy, and ``("next", "done")``."""
     tensors: dict[Any, Tensor] = {key: torch.from_numpy(array).transpose(0, 1) for key, array in arrays.items()}
     after = {key[1]: tensors.pop(key) for key in arrays if key[0] == "next"}
     nested = {key: tensors.pop(key) for key in list(tensors) if isinstance(key, tuple)}
-    now = split(tensors.pop("observation")) | tensors
-    after = split(after.pop("observation")) | after
-    if "action_mask" in now and not now["action_mask"].any(-1).all():
+    now = env.split(tensors.pop("observation")) | tensors
+    after = env.split(after.pop("observation")) | after
+    if "action_mask" in now and not all(x.any(-1).all() for x in choices(env.action_spec, now["action_mask"])):
         raise UserError("the environment's action_mask allows no action in some state: it must allow at least one")
     after["done"] = after["terminated"] | after["truncated"]
     rollout = _unchecked({**now, "next": _unchecked(after)})

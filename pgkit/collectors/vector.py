@@ -78,11 +78,7 @@ class VectorCollector:
         self._outputs = dict(zip(self._keys, example(env, actor), strict=True))
         self._workers: Workers | None = None
         self._act: Act | None = None
-        self._traced: list[int] = []
-        stores = [store for module in actor.modules() for store in (module._parameters, module._buffers)]
-        self._tensors: list[tuple[Any, str]] = [
-            (store, name) for store in stores for name, x in store.items() if x is not None
-        ]
+        self._traced: list[Any] = []
 
     def __iter__(self) -> Iterator[TensorDictBase]:
         while self.total_frames < 0 or self.frames < self.total_frames:
@@ -103,7 +99,7 @@ class VectorCollector:
                 fill(arrays, self.env.arrays, act, self._keys, self.env.num_envs, seed)
         self.frames += self.frames_per_batch
         self._rollouts += 1
-        return as_rollout(arrays, self.env.split)
+        return as_rollout(arrays, self.env)
 
     def state_dict(self) -> dict[str, Any]:
         """Counters, and every environment's state (see :class:`~pgkit.envs.ArrayEnv`)."""
@@ -131,11 +127,15 @@ class VectorCollector:
         return self._workers
 
     def _policy(self) -> Act:
-        """The traced actor, traced again if its tensors are other ones than before (moved, or replaced)."""
-        tensors = [store[name].data_ptr() for store, name in self._tensors]
-        if self._act is None or tensors != self._traced:
+        """The traced actor, traced again where its modules, their modes or tensors are not as before."""
+        traced: list[Any] = []
+        for module in self.actor.modules():
+            traced += id(module), module.training
+            tensors = (*module._parameters.values(), *module._buffers.values())
+            traced += [x.data_ptr() for x in tensors if x is not None]
+        if self._act is None or traced != self._traced:
             start = time.perf_counter()
             obs = torch.from_numpy(self.env.arrays.obs)
-            self._act, self._traced = trace(self.actor, obs, self._compile, self.env.split), tensors
+            self._act, self._traced = trace(self.actor, obs, self._compile, self.env.split), traced
             self.compile_seconds += time.perf_counter() - start
         return self._act

@@ -74,6 +74,7 @@ class Workers:
             self.pipes.append(ours)
             processes.append(process)
         self.close = weakref.finalize(self, _stop, self.pipes, processes)
+        self._asked = [True] * len(self.pipes)  # whose answer is not read yet: the first one says that it is up
         try:
             self._answers()  # the processes are up
         except WorkerEnded as error:
@@ -84,6 +85,7 @@ class Workers:
 
     def begin(self, weights: Iterable[Tensor], seed: int, random: bool = False) -> None:
         """Starts a rollout with these weights, the values of the actor's ``state_dict()``."""
+        self._answers()  # of a rollout that was interrupted (Ctrl-C in a notebook) or is not wanted any more
         with torch.no_grad():
             for mine, theirs in zip(self._actor.state_dict().values(), weights, strict=True):
                 mine.copy_(theirs)
@@ -115,19 +117,24 @@ class Workers:
         self._ask([("load", part) for part in parts])
 
     def _ask(self, requests: list[Any]) -> list[Any]:
+        self._answers()
         self._send(requests)
         return self._answers()
 
     def _send(self, requests: list[Any]) -> None:
-        for pipe, request in zip(self.pipes, requests, strict=True):
+        for i, (pipe, request) in enumerate(zip(self.pipes, requests, strict=True)):
+            self._asked[i] = True
             pipe.send(request)
 
     def _answers(self) -> list[Any]:
-        """Waits for every process's answer."""
+        """Waits for the answer of every process that was asked, and returns them."""
         answers = []
         for i, pipe in enumerate(self.pipes):
+            if not self._asked[i]:
+                continue
             try:
                 answer, failure = pipe.recv()
+                self._asked[i] = False
             except (EOFError, ConnectionError):
                 self.close()
                 raise WorkerEnded(f"collector worker {i} ended (killed, or out of memory)") from None

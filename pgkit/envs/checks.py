@@ -36,8 +36,10 @@ def check_step(env: gym.Env, result: Any) -> None:
             "truncated, info)"
         )
     _check_observation(env, "step", result[0])
-    if np.size(result[1]) != 1:
-        raise UserError(f"{_name(env)}.step returned a reward of shape {np.shape(result[1])}: return one number")
+    reward = result[1]
+    if np.ndim(reward) or isinstance(reward, str) or not np.isfinite(np.asarray(reward, dtype=float)):
+        found = f"of shape {np.shape(reward)}: return one number" if np.ndim(reward) else f"{reward!r}: return a number"
+        raise UserError(f"{_name(env)}.step returned a reward {found}, float(reward)")
 
 
 def _check_observation(env: gym.Env, method: str, obs: Any) -> None:

@@ -11,7 +11,10 @@ from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 
 from pgkit.errors import UserError
 
-TAKEN = ("action", "action_log_prob", "reward", "done", "terminated", "truncated", "next", "is_init", "recurrent_state")
+TAKEN = (
+    "action", "action_log_prob", "reward", "done", "terminated", "truncated", "next", "is_init", "recurrent_state",
+    "episode_reward", "step_count", "advantage", "value_target", "state_value", "loc", "scale", "logits",
+)  # fmt: skip
 
 
 class Entry(NamedTuple):

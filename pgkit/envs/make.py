@@ -14,7 +14,7 @@ from torchrl.envs import EnvBase
 
 from pgkit.envs.action_repeat import ActionRepeat
 from pgkit.envs.vector import VectorEnv
-from pgkit.errors import UserError
+from pgkit.errors import UserError, whole
 
 
 def make(
@@ -52,6 +52,8 @@ def make(
             f"envs.make takes an id, or a function or class that makes one environment, this is a "
             f"{type(env_id).__name__}: envs.make(lambda: ...)"
         )
+    whole(0, seed=seed, num_envs=num_envs, workers=workers)
+    whole(1, action_repeat=action_repeat)
     if num_envs < 1 or workers < 1 or workers > num_envs:
         raise UserError(
             f"num_envs={num_envs}, workers={workers}: every worker needs at least one environment; "
@@ -110,6 +112,9 @@ def make_one(env_id: str, **kwargs: Any) -> gym.Env:
 
 def _not_installed(env_id: str, error: Exception) -> UserError:
     module, colon, _ = env_id.partition(":")
+    cause = error.__cause__ or error
+    if colon and getattr(cause, "name", None) not in (None, module):
+        return UserError(f"environment '{env_id}': importing '{module}' failed ({cause})")
     if colon:
         return UserError(f"environment '{env_id}': no module '{module}' to import, neither here nor installed")
     if newest := _successor(env_id):

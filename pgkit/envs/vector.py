@@ -122,6 +122,10 @@ def action_spec(space: gym.Space, num_envs: int) -> TensorSpec:
         return Bounded(low.expand(shape), high.expand(shape), shape, dtype=torch.float32)
     if isinstance(space, spaces.Discrete):
         return Categorical(int(space.n), shape=(num_envs,))
+    if isinstance(space, spaces.MultiDiscrete | spaces.MultiBinary) and len(space.shape) != 1:
+        raise UserError(
+            f"the action space, {type(space).__name__}, has shape {space.shape}, actions are vectors: flatten it"
+        )
     if isinstance(space, spaces.MultiDiscrete):
         return MultiCategorical(space.nvec.tolist(), shape=(num_envs, len(space.nvec)))
     if isinstance(space, spaces.MultiBinary):

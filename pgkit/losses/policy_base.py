@@ -153,8 +153,11 @@ class PolicyLoss(Loss):
             return dist.entropy()
         except NotImplementedError:
             draws = range(self.samples_mc_entropy)
-            log_probs = [sample_and_log_prob(dist, reparameterize=dist.has_rsample)[1] for _ in draws]
-            return -torch.stack(log_probs).mean(0)
+            log_prob = torch.stack([sample_and_log_prob(dist, reparameterize=dist.has_rsample)[1] for _ in draws])
+            if not dist.has_rsample:  # no gradient through the draw: that of its probability, E[log p grad log p]
+                score = log_prob.detach()
+                log_prob = score + score * log_prob - score.square()
+            return -log_prob.mean(0)
 
     def get_advantage(self, batch: TensorDictBase) -> Tensor:
         """The batch's advantage, computed by this loss's own estimator only if the user made one."""
@@ -162,8 +165,7 @@ class PolicyLoss(Loss):
             if self._value_estimator is None:
                 raise KeyError(
                     f"the batch has no '{self.tensor_keys.advantage}', which {type(self).__name__} reads: run an "
-                    "advantage block on the rollout first (advantages.GAE(critic)(rollout)), or call "
-                    "loss.make_value_estimator()"
+                    "advantage block on the rollout first (advantages.GAE(critic)(rollout))"
                 )
             self._value_estimator(
                 batch,

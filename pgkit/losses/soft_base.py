@@ -78,6 +78,10 @@ class SoftQLoss(QLoss):
                 f"temperature={temperature!r}: give a block with alpha and loss (controllers.Temperature, "
                 "controllers.FixedTemperature(0.2))"
             )
+        if temperature is not None and not (isinstance(temperature.alpha, Tensor) and temperature.alpha.numel() == 1):
+            raise UserError(
+                f"{type(temperature).__name__}.alpha is {temperature.alpha!r}: make it a tensor of one number"
+            )
         self.set_distance(loss_function)
         if subset is not None and not 1 <= subset <= self.num_critics:
             raise UserError(f"subset={subset} of {self.num_critics} critics: give a number from 1 to the latter")
@@ -106,7 +110,7 @@ class SoftQLoss(QLoss):
     def alpha(self) -> Tensor:
         r"""The temperature :math:`\alpha`, a detached scalar."""
         if self.temperature is not None:
-            return self.temperature.alpha.clone()  # a controller may move it while the loss is computed
+            return self.temperature.alpha.detach().clone()  # a controller may move it while the loss is computed
         with torch.no_grad():
             bounded = self._log_bounds != (None, None)
             return (self.log_alpha.clamp_(*self._log_bounds) if bounded else self.log_alpha).exp()

@@ -36,6 +36,11 @@ def load(path: Path) -> Any:
         raise UserError(f"{path.parent.parent} has no checkpoint {path.name}: nothing was saved there yet")
     try:
         return torch.load(path, map_location="cpu", weights_only=False)
+    except (ImportError, AttributeError) as error:
+        raise UserError(
+            f"{path} needs code that is not found ({error}): run this where the recipe's own modules are, or put their "
+            "folder on PYTHONPATH"
+        ) from error
     except (RuntimeError, EOFError, pickle.UnpicklingError) as error:
         raise UserError(f"{path} is damaged: {str(error).splitlines()[0]}") from error
 

@@ -21,9 +21,9 @@ PACKAGES = ("pgkit", "torch", "torchrl", "tensordict", "numpy", "gymnasium", "mu
 def choose(args: RunArgs, recipe: str) -> Path:
     """The directory that the settings ask for; a UserError if it already holds a run. Writes nothing."""
     if args.resume:
-        return args.resume
+        return Path(args.resume)
     name = f"{args.env_id.replace('/', '-')}__{recipe}__{args.seed}__{time.strftime('%Y%m%d-%H%M%S')}"
-    path = args.run_dir or Path("runs") / name
+    path = Path(args.run_dir or Path("runs") / name)
     if path.exists() and not path.is_dir():
         raise UserError(f"--run-dir {path} is a file; give a directory")
     if holds_run(path):
@@ -46,7 +46,7 @@ def write_config(path: Path, args: RunArgs, recipe: str, resumed_at: list[int]) 
     config = {
         "recipe": recipe,
         "settings": dataclasses.asdict(args) | {"run_dir": path, "resume": None},
-        "command": sys.argv,
+        "command": read_config(path)["command"] if resumed_at else sys.argv,
         "versions": versions(),
         "git_revision": git_revision(),
         "resumed_at": resumed_at,

@@ -69,7 +69,16 @@ def act(policy: torch.nn.Module, obs: np.ndarray, deterministic: bool = True) ->
     return Acting(policy)(obs, np.ones(len(obs), bool), deterministic)
 
 
-def play(policy: torch.nn.Module, env: Any, episodes: int) -> tuple[np.ndarray, np.ndarray]:
+def check_playable(env: Any) -> None:
+    """A ``UserError`` for an environment that :func:`play` cannot step."""
+    if isinstance(env, TransformedEnv) or not hasattr(env, "arrays"):  # the former's arrays know no transforms
+        raise UserError(
+            f"evaluation plays what envs.make gives, a {type(env).__name__} is none of that: "
+            "use env.rollout(steps, actor)"
+        )
+
+
+def play(policy: torch.nn.Module, env: Any, episodes: int, deterministic: bool = True) -> tuple[np.ndarray, np.ndarray]:
     """Returns and lengths of ``episodes`` whole episodes, each ``[episodes]``, ordered by env slot.
 
     Every one of the env's N slots plays its own share (``episodes / N``) to the end: to take whichever
@@ -78,13 +87,10 @@ def play(policy: torch.nn.Module, env: Any, episodes: int) -> tuple[np.ndarray, 
     Args:
         policy: a TensorDict actor that reads ``observation`` and writes ``action``.
         env: has ``.arrays``: ``reset()``, ``step(action)``, ``obs``, ``episode_reward``, ``step_count``.
+        deterministic: the likeliest actions, or draws.
     """
     whole(1, episodes=episodes)
-    if isinstance(env, TransformedEnv) or not hasattr(env, "arrays"):  # the former's arrays know no transforms
-        raise UserError(
-            f"evaluation plays what envs.make gives, a {type(env).__name__} is none of that: "
-            "use env.rollout(steps, actor)"
-        )
+    check_playable(env)
     arrays, act = env.arrays, Acting(policy, getattr(env, "split", None))
     with preserved_rng(), _evaluating(policy):
         obs = arrays.reset()
@@ -93,7 +99,7 @@ def play(policy: torch.nn.Module, env: Any, episodes: int) -> tuple[np.ndarray, 
         fresh = np.ones(slots, bool)
         finished: list[list[tuple[float, int]]] = [[] for _ in range(slots)]
         while any(len(done) < wanted for done, wanted in zip(finished, share, strict=True)):
-            _, _, terminated, truncated = arrays.step(act(arrays.obs, fresh))
+            _, _, terminated, truncated = arrays.step(act(arrays.obs, fresh, deterministic))
             fresh = terminated | truncated
             if (arrays.step_count[~fresh] == LONG_EPISODE).any():
                 getLogger("pgkit").warning(
@@ -107,9 +113,9 @@ def play(policy: torch.nn.Module, env: Any, episodes: int) -> tuple[np.ndarray, 
     return np.array([reward for reward, _ in flat]), np.array([length for _, length in flat])
 
 
-def evaluate(policy: torch.nn.Module, env: Any, episodes: int) -> dict[str, float]:
+def evaluate(policy: torch.nn.Module, env: Any, episodes: int, deterministic: bool = True) -> dict[str, float]:
     """``eval/mean_reward``, ``eval/std_reward`` (population) and ``eval/mean_ep_length`` of :func:`play`."""
-    rewards, lengths = play(policy, env, episodes)
+    rewards, lengths = play(policy, env, episodes, deterministic)
     return {
         "eval/mean_reward": float(rewards.mean()),
         "eval/std_reward": float(rewards.std()),

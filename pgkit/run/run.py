@@ -4,9 +4,11 @@ import logging
 import math
 import shlex
 import signal
+import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from statistics import mean, median
 from types import FrameType
 from typing import Any
@@ -18,12 +20,12 @@ from torchrl.envs import EnvBase
 from pgkit.errors import UserError
 from pgkit.run import checkpoint, directory, seeding
 from pgkit.run.clock import Clock
-from pgkit.run.evaluate import evaluate
+from pgkit.run.evaluate import check_playable, evaluate
 from pgkit.run.metrics import Metrics, averages, column, finished_episodes, read_csv, warm
 from pgkit.run.plots import plot
 from pgkit.run.policy import describe_env
 from pgkit.run.progress import Live
-from pgkit.run.settings import RunArgs, check, recipe_target
+from pgkit.run.settings import RunArgs, as_resumed, check, recipe_target
 
 NAN = float("nan")
 
@@ -60,6 +62,10 @@ class Run:
         config = directory.read_config(self.dir)
         if config["recipe"] != self.recipe:
             raise UserError(f"{self.dir} holds a run of {config['recipe']}, not of {self.recipe}: use that recipe")
+        as_resumed(self.args, self.dir)
+        first, now = (Path(command[0]).name for command in (config["command"], sys.argv))
+        if first.endswith(".py") and first != now:
+            logging.getLogger("pgkit").warning("%s is a run of %s, this is %s: is it the same?", self.dir, first, now)
         saved = checkpoint.load(self.dir / "checkpoints" / "latest.pt")
         if self.args.total_frames <= saved["frames"]:
             raise UserError(
@@ -98,10 +104,12 @@ class Run:
             checkpoint.restore(tracked, self._saved["states"], self.dir / "checkpoints" / "latest.pt")
             seeding.set_rng_state(self._saved["rng"])
             resumed_at = [*directory.read_config(self.dir)["resumed_at"], self.frames]
+        self._policy, self._make_env = policy, eval_env
+        self._eval_env()  # what is wrong with it shows before the training, not after
         directory.write_config(self.dir, self.args, self.recipe, resumed_at)
         self._metrics = Metrics(self.dir, upto=self.frames)
         self._live = Live(self.args.total_frames, self.frames)
-        self._policy, self._make_env, self._tracked = policy, eval_env, tracked
+        self._tracked = tracked
         self._clock.restart(self.frames)
 
     def step(
@@ -170,7 +178,16 @@ class Run:
     def _eval_env(self) -> Any:
         if self._eval is None:
             with seeding.preserved_rng():
-                self._eval = self._make_env(num_envs=min(self.args.eval_episodes, 10), seed=self.args.seed)
+                try:
+                    self._eval = self._make_env(num_envs=min(self.args.eval_episodes, 10), seed=self.args.seed)
+                except TypeError as error:
+                    if "argument" not in str(error):
+                        raise
+                    raise UserError(
+                        f"track(eval_env=...) is called as eval_env(num_envs=, seed=), this one cannot be ({error}): "
+                        "functools.partial(envs.make, env_id)"
+                    ) from error
+            check_playable(self._eval)
         return self._eval
 
     def _evaluate(self, row: Mapping[str, float]) -> dict[str, float]:

@@ -226,6 +226,20 @@ def _saved_settings(args_class: type[RunArgs], run_dir: Path) -> dict[str, Any]:
     return {name: _typed(value, hints[name]) for name, value in saved.items()}
 
 
+def as_resumed(args: RunArgs, run_dir: Path) -> None:
+    """Gives ``args`` the settings of the run that goes on, as the command line does; a warning names other values."""
+    saved = _saved_settings(type(args), run_dir)
+    kept = {name: saved[name] for name in saved.keys() - _FREE_ON_RESUME if getattr(args, name) != saved[name]}
+    if getattr(args, "anneal", False):
+        kept.pop("learning_rate", None)
+    kept.pop("run_dir", None)
+    if kept:
+        names = ", ".join(f"{name}={value!r}" for name, value in sorted(kept.items()))
+        logging.getLogger("pgkit").warning("the resumed run keeps its own settings: %s", names)
+    for name, value in kept.items():
+        setattr(args, name, value)
+
+
 def _typed(value: Any, hint: Any) -> Any:
     kinds = (hint, *typing.get_args(hint))
     if isinstance(value, str) and Path in kinds:

@@ -55,7 +55,8 @@ def explain(chain: Chain, batch: TensorDictBase, error: Exception) -> str | None
     if isinstance(error, RuntimeError | IndexError):
         return None
     present = ", ".join(f"{show(key)} {shape(batch[key])}" for key in batch.keys(True, True))
-    return f"{chain.name} cannot read its batch: {text}. The batch has {present}"
+    advice = "; what forward reads besides is named in loss.in_keys (override _reads)" * isinstance(error, KeyError)
+    return f"{chain.name} cannot read its batch: {text}{advice}. The batch has {present}"
 
 
 def wrong_action(chain: Chain, batch: TensorDictBase) -> str | None:

@@ -20,6 +20,7 @@ from pgkit.updates import restoring, wiring
 from pgkit.updates.chain import Chain
 from pgkit.updates.diagram import diagram
 from pgkit.updates.entries import another_policy
+from pgkit.updates.estimating import estimated
 from pgkit.updates.optimizers import check_optimizer
 from pgkit.updates.recorded import Block, recorded_block
 from pgkit.updates.sequences import as_rows, check_one_memory, check_time
@@ -106,6 +107,7 @@ class OnPolicyUpdate:
         self._generator = torch.Generator().manual_seed(int(torch.randint(2**62, ())) if seed is None else seed)
         self._step: GradientStep | None = None
         self._keys: list[Any] = []
+        self._old: list[Any] = []  # of these, what losses measure a change from: as before the first epoch
         self._estimate: Block | None = None
         self._estimate_seconds = 0.0
         self._batch: TensorDictBase | None = None
@@ -125,7 +127,7 @@ class OnPolicyUpdate:
         flat, epoch = rollout, 0
         for epoch in range(1, self.epochs + 1):
             if epoch == 1 or self.recompute_advantage:
-                flat = self._flatten(rollout)
+                flat = self._flatten(rollout) if epoch == 1 else self._flatten(rollout).update(flat.select(*self._old))
             if self._step is None:
                 self._step = self._assemble(flat, size, rows)
             if epoch == 1:
@@ -178,11 +180,14 @@ class OnPolicyUpdate:
 
     def _flatten(self, rollout: TensorDictBase) -> TensorDictBase:
         """The advantage, then the entries that the loss reads as ``[rows, ...]``."""
-        if self.advantage is not None:
-            self._estimate = self._estimate or self._prepare(self.advantage, rollout)
-            self._estimate(rollout)
+        if self.advantage is not None and self._estimate is None:
+            self._estimate = self._prepare(self.advantage, rollout)
+        rollout = estimated(self.loss, self._estimate, rollout)
         if self._step is None:
             self._keys = wiring.read_keys(self.loss, rollout)
+            chain = Chain(self.loss, None)
+            anchors = [*chain.keys("value"), *chain.keys("sample_log_prob")]
+            self._old = [key for key in anchors if key in self._keys]
         return as_rows(rollout.select(*self._keys), self.sequence_length)
 
     def _prepare(self, advantage: Block, rollout: TensorDictBase) -> Block:
@@ -194,7 +199,7 @@ class OnPolicyUpdate:
         start = time.perf_counter()
         try:
             return recorded_block(cast(TensorDictModuleBase, advantage), rollout)
-        except RuntimeError as error:
+        except (RuntimeError, KeyError) as error:  # KeyError: it reads an entry that its in_keys leave out
             getLogger("pgkit").debug("the advantage block cannot be recorded: %s", error)
             return advantage
         finally:

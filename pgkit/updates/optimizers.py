@@ -111,9 +111,22 @@ def functional(optimizer: Any, fused: bool, params: list[Tensor] | None = None) 
     rates = [rate.clone() for rate in rates]
     applies = [make(optimizer, group, rate, fused) for group, rate in zip(groups, rates, strict=True)]
 
+    state, names = optimizer.state, [name for name in optimizer.defaults if name != "lr"]
+
     def read_learning_rates() -> None:
-        for group, rate in zip(sources, rates, strict=True):
-            rate.fill_(group["lr"])
+        if optimizer.state is not state:
+            raise UserError(
+                "the optimizer was loaded after its first step in this update: load it before, or load the update's "
+                "own state (update.load_state_dict)"
+            )
+        for source, group, rate in zip(sources, groups, rates, strict=True):
+            if changed := [name for name in names if source.get(name) != group.get(name)]:
+                raise UserError(
+                    f"the optimizer's {changed[0]} changed from {group[changed[0]]} to {source[changed[0]]}: while "
+                    "training only lr may (OneCycleLR and CyclicLR: cycle_momentum=False); build a new update for "
+                    "another value"
+                )
+            rate.fill_(source["lr"])
 
     return _in_turn(applies, [len(group["params"]) for group in groups]), read_learning_rates, rates
 

@@ -72,6 +72,7 @@ class GradientStep:
         self.names = [*names, "grad_norm"]
         self.compile_seconds = 0.0
         self._runs: dict[Any, Step] = {}
+        self._coefficients: list[int] = []
         params = optimizers.parameters(optimizer)
         if only is not None:
             kept = {id(p) for reached in only.values() for p in reached}
@@ -108,7 +109,13 @@ class GradientStep:
         self._compile, self._written, self._may_fall_back = compile, written, may_fall_back
 
     def begin(self) -> None:
-        """Reads the learning rates off the optimizer; call it before a series of steps."""
+        """Reads the learning rates off the optimizer, and looks for coefficients of the loss that were replaced.
+
+        Call it before a series of steps.
+        """
+        coefficients = [id(x) for x in self.loss._buffers.values()]
+        if coefficients != self._coefficients:  # compiled steps hold the former ones
+            self._runs, self._coefficients = {}, coefficients
         self._read_learning_rates()
         self.optimizer._opt_called = True  # what torch's schedulers look at before they warn that none stepped
 

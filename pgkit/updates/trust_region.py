@@ -16,8 +16,9 @@ from pgkit.functional import conjugate_gradient
 from pgkit.updates import restoring, wiring
 from pgkit.updates.chain import Chain
 from pgkit.updates.diagram import diagram
+from pgkit.updates.estimating import estimated
 from pgkit.updates.optimizers import check_optimizer, parameters
-from pgkit.updates.sequences import as_rows
+from pgkit.updates.sequences import as_rows, check_time
 from pgkit.updates.step import GradientStep
 
 CRITIC = "loss_critic"
@@ -100,9 +101,10 @@ class TrustRegionUpdate:
             )
 
     def __call__(self, rollout: TensorDictBase) -> dict[str, float]:
-        """Trains on a rollout ``[num_envs, T]`` (or any batch shape)."""
-        if self.advantage is not None:
-            self.advantage(rollout)
+        """Trains on a rollout ``[num_envs, T]``: time is the last dimension."""
+        if not self._names and self.advantage is not None:
+            check_time(rollout)
+        rollout = estimated(self.loss, self.advantage, rollout)
         flat = as_rows(rollout.select(*wiring.read_keys(self.loss, rollout)), None)
         if not self._names:
             self._assemble(flat)

@@ -21,14 +21,15 @@ from pgkit.updates.tables import NoTables, TableError
 def read_keys(loss: nn.Module, data: TensorDictBase) -> list[Any]:
     """Entries of ``data`` that the loss may read: its ``in_keys`` and its configurable keys, those present.
 
-    ``next`` entries are for estimating advantages, so they stay out where the advantage is there.
+    Where the advantage is there, the ``next`` entries that TorchRL's own losses would estimate it from stay out.
     """
     present = set(data.keys(True, True))
     keys = list(getattr(loss, "in_keys", None) or present)
     if hasattr(loss, "tensor_keys"):
         configured = [getattr(loss.tensor_keys, field.name) for field in fields(loss.tensor_keys)]
         keys += [key for key in configured if isinstance(key, str | tuple)]
-        if getattr(loss.tensor_keys, "advantage", None) in present:
+        torchrl = type(loss).__module__.startswith("torchrl.")
+        if torchrl and getattr(loss.tensor_keys, "advantage", None) in present:
             keys = [key for key in keys if not (isinstance(key, tuple) and key[0] == "next")]
     keys += [("collector", "mask"), "steps_to_next_obs"]  # read by TorchRL's estimators, which no loss's keys say
     keys += [*getattr(getattr(loss, "actor_network", None), "dist_params_keys", ())]

@@ -1,5 +1,9 @@
+import gymnasium as gym
+import numpy as np
 import pytest
 import torch
+from tensordict.nn import TensorDictModule
+from torch import nn
 from torchrl.envs import RewardScaling, TransformedEnv
 
 from pgkit import collectors, envs, modules
@@ -191,3 +195,78 @@ def test_torchrl_collector_ends_at_total_frames_after_a_resume():
     collector = collectors.TorchRLCollector(env, modules.categorical_actor(env), frames_per_batch=20, total_frames=100)
     collector.load_state_dict({"frames": 60})
     assert [collector.frames for _ in collector] == [80, 100]
+
+
+def counted():
+    """Observations count the steps of an episode."""
+
+    class Counting(gym.Env):
+        observation_space, action_space = gym.spaces.Box(0, 1e6, (1,)), gym.spaces.Box(-1, 1, (1,))
+
+        def reset(self, *, seed=None, options=None):
+            super().reset(seed=seed)
+            self.t = 0
+            return np.zeros(1, "f4"), {}
+
+        def step(self, action):
+            self.t += 1
+            return np.full(1, self.t, "f4"), float(action[0]), False, False, {}
+
+    return Counting
+
+
+def test_a_policy_of_numpy_and_one_that_changes_its_mode_act_as_they_are():
+    class Scripted(nn.Module):
+        def forward(self, obs):
+            turned = np.where(obs.numpy() > 25, -1.0, 1.0)
+            return torch.as_tensor(turned, dtype=torch.float32) * (1.0 if self.training else 0.5)
+
+    actor = TensorDictModule(Scripted(), in_keys=["observation"], out_keys=["action"])
+    collector = collectors.VectorCollector(envs.make(counted(), 2), actor, frames_per_batch=100, compile="off")
+    assert collector.rollout()["action"][0].unique().tolist() == [-1.0, 1.0]
+    net = nn.Sequential(nn.Linear(1, 1), nn.Dropout(0.5))
+    dropout = TensorDictModule(net, ["observation"], ["action"])
+    collector = collectors.VectorCollector(envs.make(counted(), 2), dropout, frames_per_batch=100, compile="off")
+    assert (collector.rollout()["action"] == 0).any()
+    dropout.eval()
+    assert (collector.rollout()["action"] != 0).any() and not (collector.rollout()["action"] == 0).any()
+    net[0] = nn.Linear(1, 1)
+    nn.init.zeros_(net[0].weight)
+    nn.init.constant_(net[0].bias, 7.0)
+    assert (collector.rollout()["action"] == 7).all()
+
+
+def test_after_an_interrupted_rollout_the_next_is_whole(monkeypatch):
+    env = envs.make(counted(), 2, workers=2)
+    actor = modules.gaussian_actor(env)
+    collector = collectors.VectorCollector(env, actor, frames_per_batch=100, compile="off")
+    collector.rollout()
+
+    def interrupted():
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(collector._workers, "finish", interrupted)
+        collector.rollout()
+    for _ in range(2):
+        steps = collector.rollout()["observation"][..., 0]
+        assert (steps.diff(dim=1) == 1).all()
+    collector.shutdown()
+
+
+def test_a_choice_whose_mask_allows_nothing_is_refused():
+    class Masked(gym.Env):
+        action_space = gym.spaces.MultiDiscrete([2, 3])
+        observation_space = gym.spaces.Dict(x=gym.spaces.Box(-1, 1, (1,)), action_mask=gym.spaces.MultiBinary(5))
+
+        def reset(self, *, seed=None, options=None):
+            super().reset(seed=seed)
+            return {"x": np.zeros(1, "f4"), "action_mask": np.array([0, 0, 1, 1, 1], "i1")}, {}
+
+        def step(self, action):
+            return self.reset()[0], 0.0, False, False, {}
+
+    env = envs.make(Masked, flatten=False)
+    actor = modules.categorical_actor(env, encoder=modules.dict_encoder({"x": nn.Linear(1, 4)}))
+    with pytest.raises(UserError, match="action_mask allows no action"):
+        collectors.VectorCollector(env, actor, frames_per_batch=4, compile="off").rollout()

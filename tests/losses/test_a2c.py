@@ -115,3 +115,19 @@ def test_an_action_with_a_gradient_of_its_own_is_refused():
     batch["action"].requires_grad_()
     with pytest.raises(RuntimeError, match=r"stored action requires grad: collect under torch.no_grad\(\)"):
         loss(batch)
+
+
+def test_the_entropy_of_draws_without_a_gradient_has_one():
+    # of a Gaussian: dH / d log_std = 1
+    class Unreparameterized(torch.distributions.Normal):
+        has_rsample = False
+        entropy = torch.distributions.Distribution.entropy  # none in closed form
+
+    torch.manual_seed(0)
+    env = envs.make("Pendulum-v1")
+    loss = losses.A2CLoss(modules.gaussian_actor(env), modules.state_value(env))
+    log_std = torch.full((200_000,), 0.3, requires_grad=True)
+    entropy = loss.entropy(Unreparameterized(torch.zeros(200_000), log_std.exp()))
+    entropy.mean().backward()
+    assert entropy.mean().item() == pytest.approx(0.5 * math.log(2 * math.pi * math.e) + 0.3, abs=0.01)
+    assert log_std.grad is not None and log_std.grad.sum().item() == pytest.approx(1.0, abs=0.03)

@@ -71,3 +71,14 @@ def test_an_environment_with_transforms_is_not_played_without_them():
     env = envs.make("Pendulum-v1", num_envs=2)
     with pytest.raises(UserError, match="a TransformedEnv is none of that: use env.rollout"):
         run.play(modules.gaussian_actor(env), TransformedEnv(env, RewardScaling(0, 1)), episodes=2)
+
+
+def test_draws_are_evaluated_on_request():
+    env = envs.make("Pendulum-v1", 2, seed=1)
+    actor = modules.gaussian_actor(env, log_std=0.5)
+    env.set_seed(1)
+    first = run.evaluate(actor, env, 2)["eval/mean_reward"]
+    env.set_seed(1)
+    assert run.evaluate(actor, env, 2)["eval/mean_reward"] == first
+    env.set_seed(1)
+    assert run.evaluate(actor, env, 2, deterministic=False)["eval/mean_reward"] != first

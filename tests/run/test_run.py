@@ -6,6 +6,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
@@ -239,3 +240,21 @@ def test_the_default_directory_names_env_recipe_and_seed(kit: SimpleNamespace, t
     args.run_dir = None
     log = kit.train(args)
     assert log.dir.parent == Path("runs") and log.dir.name.startswith("Fake-Count-v0__walk__1__20")
+
+
+def test_an_evaluation_environment_that_cannot_be_made_is_said_before_training(tmp_path: Path):
+    for make, message in (
+        (lambda: envs.make("Pendulum-v1"), r"is called as eval_env\(num_envs=, seed=\)"),
+        (lambda num_envs, seed: gym.make("Pendulum-v1"), "plays what envs.make gives, a TimeLimit is none of that"),
+    ):
+        with run.Run(arguments(tmp_path / "r"), "walk") as log, pytest.raises(UserError, match=message):
+            log.track(policy=torch.nn.Identity(), eval_env=make)
+        assert not (tmp_path / "r").exists()
+
+
+def test_a_run_resumed_from_python_keeps_its_settings(kit: SimpleNamespace, tmp_path: Path, caplog: Any):
+    kit.train(arguments(tmp_path / "r", seed=5))
+    args = RunArgs(env_id="Fake/Count-v0", resume=tmp_path / "r", total_frames=80)
+    kit.train(args)
+    assert args.seed == 5 and "keeps its own settings: seed=5" in caplog.text
+    assert json.loads((tmp_path / "r" / "config.json").read_text())["settings"]["seed"] == 5
