@@ -41,7 +41,9 @@ def add(table: Path, experiment: str, runs: tyro.conf.Positional[tuple[Path, ...
         runs: run directories.
         speed: a short run, for the speed of the whole experiment.
     """
-    curves = {str(read_config(run)["seed"]): column(read_csv(run / "metrics.csv")[1], EVALUATION) for run in runs}
+    curves = {
+        str(read_config(run)["settings"]["seed"]): column(read_csv(run / "metrics.csv")[1], EVALUATION) for run in runs
+    }
     rows = [row for row in read(table) if row["experiment"] != experiment or row["seed"] not in curves]
     for seed, curve in curves.items():
         rows += [
