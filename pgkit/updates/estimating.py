@@ -43,6 +43,7 @@ def estimated(
             "advantage block: add advantage=advantages.GAE(critic)"
         )
     check_time(rollout)
+    rollout = rollout.copy()  # the next epoch finds none there, and estimates again if it is to
     params = getattr(loss, "critic_network_params", None)
     with torch.no_grad():
         estimator(

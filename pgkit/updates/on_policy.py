@@ -32,8 +32,8 @@ class OnPolicyUpdate:
 
     Args:
         loss: any TorchRL ``LossModule``; the sum of its ``loss_*`` entries is minimized.
-        advantage: block that writes ``advantage`` and ``value_target`` into the rollout, pgkit's or TorchRL's; None
-            where the rollout has them or the loss needs none.
+        advantage: block that returns the rollout with ``advantage`` and ``value_target``, pgkit's or TorchRL's; None
+            where the rollout has them, the loss needs none, or it was given an estimator (``make_value_estimator``).
         optimizer: any ``torch.optim`` optimizer over the parameters to train.
         epochs: passes over the rollout.
         minibatch_size: rows of a minibatch; the last of an epoch may be smaller. None: the whole rollout.

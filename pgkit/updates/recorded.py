@@ -46,7 +46,7 @@ def recorded(step: Step, held: Sequence[Tensor], data: TensorDictBase, index: Te
     for shift in range(1, 5):  # a decision taken on values outside torch (numpy) is not seen: it shows on other rows
         other = (index + shift * (len(index) + 1)) % (index.max() + 1)
         # data that is the batch may be used without the index: it gets other rows as well, some of them repeated
-        rows = _rows(data, other // (1 + shift)) if data.batch_size == index.shape else data
+        rows = _other_rows(data, other // (1 + shift)) if data.batch_size == index.shape else data
         expected, got = (undone(held, lambda f=f, rows=rows, other=other: f(rows, other)) for f in (step, first))
         if got is None and decisions.numbers:
             raise RuntimeError("the step reads a number off a tensor, and it is another on other rows")
@@ -72,7 +72,7 @@ def recorded(step: Step, held: Sequence[Tensor], data: TensorDictBase, index: Te
     return run
 
 
-def _rows(data: TensorDictBase, rows: Tensor) -> TensorDictBase:
+def _other_rows(data: TensorDictBase, rows: Tensor) -> TensorDictBase:
     """``data[rows]``, as many rows as there are, in the memory layout of ``data``."""
     return cast(TensorDictBase, data.apply(lambda x: x.clone().copy_(x[rows])))
 

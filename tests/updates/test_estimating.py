@@ -41,6 +41,16 @@ def test_a_loss_s_own_estimator_sees_the_rollout_and_not_a_minibatch(loss_class)
     torch.testing.assert_close(*results, rtol=0, atol=1e-5)
 
 
+def test_a_loss_s_own_estimator_estimates_again_before_each_epoch_if_asked_to():
+    results = []
+    for again in (True, False):
+        update, rollout = make_agent(advantage=None, recompute_advantage=again), make_rollout()
+        update.loss.make_value_estimator(ValueEstimators.GAE, gamma=0.99, lmbda=0.95)
+        update(rollout)
+        results.append(parameters(update))
+    assert "advantage" not in rollout.keys() and not torch.equal(*results)
+
+
 def test_a_loss_that_would_estimate_on_minibatches_is_refused():
     update = make_agent(loss_class=torchrl.objectives.ClipPPOLoss, advantage=None)
     with pytest.raises(UserError, match="no 'advantage', which ClipPPOLoss reads; nothing writes it"):
