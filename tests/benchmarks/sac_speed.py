@@ -136,14 +136,15 @@ def replay(threads: int, prioritized: bool) -> dict[str, float]:
     bare = updates.GradientStep(
         loss, optimizer, whole.names[:-1], after=update._average, gather=lambda data, _: data.copy(), compile=True
     )  # fmt: skip
-    bare(batch, index)
+    rows = torch.arange(BATCH)
+    bare(batch, rows)
     times: dict[str, list[float]] = {"write": [], "draw": [], "step": [], "step without gather": []}
     draws = 1 if prioritized else STEPS  # as the update draws them
     for _ in range(10):
         times["write"].append(contest.milliseconds(lambda: buffer.extend(rollout), calls=100) / STEPS)
         times["draw"].append(contest.milliseconds(lambda: buffer.sample_index(BATCH, draws), calls=100) / draws)
         times["step"].append(contest.milliseconds(lambda: whole(buffer.data, index), calls=100))
-        times["step without gather"].append(contest.milliseconds(lambda: bare(batch, index), calls=100))
+        times["step without gather"].append(contest.milliseconds(lambda: bare(batch, rows), calls=100))
     result = {name: median(values) for name, values in times.items()}
     result["memory, MB"] = sum(x.numel() * x.element_size() for x in buffer.data.values(True, True)) / 1e6
     return result
