@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torchrl.data import MultiCategorical, TensorSpec
 from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import OrnsteinUhlenbeckProcessModule
 
 from pgkit.compiling import compile_record, record
 from pgkit.envs import VectorEnv
@@ -166,6 +167,11 @@ def example(env: VectorEnv, actor: TensorDictModuleBase) -> tuple[Tensor, ...]:
         )
     if elsewhere := [p.device for p in actor.parameters() if p.device.type != "cpu"]:
         raise UserError(f"the actor is on {elsewhere[0]}, environments and collectors are on the CPU: actor.to('cpu')")
+    if any(isinstance(part, OrnsteinUhlenbeckProcessModule) for part in actor.modules()):
+        raise UserError(
+            "TorchRL's OrnsteinUhlenbeckProcessModule keeps its noise in the TensorDict of the step before, which this "
+            "collector does not have: modules.OrnsteinUhlenbeck(actor, env) is carried from step to step"
+        )
     misfit = "the actor was built for another environment: build it from this one (modules.gaussian_actor(env))"
     with torch.no_grad(), torch.random.fork_rng(devices=[]):
         try:

@@ -128,6 +128,8 @@ class ArrayEnv:
         """Restores every environment by replaying the actions of its current episode."""
         self.seed, self.memory, history = state["seed"], state.get("memory"), state["history"]
         for i, env in enumerate(self.envs):
+            if state["episode"][i] < 0:  # taken before the first reset
+                continue
             self._episode[i] = state["episode"][i] - 1
             self._begin(i)
             self.episode_reward[i], self.step_count[i] = 0.0, len(history[i])
@@ -184,7 +186,8 @@ def _action_converter(space: gym.Space) -> Callable[[np.ndarray], np.ndarray]:
     """A function from the policy's actions ``[N, ...]`` to what the environments accept."""
     if isinstance(space, spaces.Box):
         low, high = space.low, space.high
-        return lambda actions: np.minimum(np.maximum(actions, low), high).astype(space.dtype, copy=False)
+        nearest = np.rint if np.issubdtype(space.dtype, np.integer) else np.asarray
+        return lambda actions: nearest(np.minimum(np.maximum(actions, low), high)).astype(space.dtype, copy=False)
     if isinstance(space, spaces.Discrete | spaces.MultiDiscrete):
         start = space.start
         return (lambda actions: actions + start) if np.any(start) else np.array

@@ -52,6 +52,8 @@ def make(
             f"envs.make takes an id, or a function or class that makes one environment, this is a "
             f"{type(env_id).__name__}: envs.make(lambda: ...)"
         )
+    if seed is None:
+        raise UserError("seed=None: give a whole number; numpy.random.randint(2**31) is another in every run")
     whole(0, seed=seed, num_envs=num_envs, workers=workers)
     whole(1, action_repeat=action_repeat)
     if num_envs < 1 or workers < 1 or workers > num_envs:

@@ -78,19 +78,20 @@ def check_playable(env: Any) -> None:
         )
 
 
-def play(policy: torch.nn.Module, env: Any, episodes: int, deterministic: bool = True) -> tuple[np.ndarray, np.ndarray]:
+def play(policy: Any, env: Any, episodes: int, deterministic: bool = True) -> tuple[np.ndarray, np.ndarray]:
     """Returns and lengths of ``episodes`` whole episodes, each ``[episodes]``, ordered by env slot.
 
     Every one of the env's N slots plays its own share (``episodes / N``) to the end: to take whichever
     episodes finish first would favour the short ones. The global random state and the policy's mode are kept.
 
     Args:
-        policy: a TensorDict actor that reads ``observation`` and writes ``action``.
+        policy: a TensorDict actor that reads ``observation`` and writes ``action``, or what ``load_policy`` gives.
         env: has ``.arrays``: ``reset()``, ``step(action)``, ``obs``, ``episode_reward``, ``step_count``.
         deterministic: the likeliest actions, or draws.
     """
     whole(1, episodes=episodes)
     check_playable(env)
+    policy = policy if isinstance(policy, torch.nn.Module) else policy.actor
     arrays, act = env.arrays, Acting(policy, getattr(env, "split", None))
     with preserved_rng(), _evaluating(policy):
         obs = arrays.reset()
@@ -113,7 +114,7 @@ def play(policy: torch.nn.Module, env: Any, episodes: int, deterministic: bool =
     return np.array([reward for reward, _ in flat]), np.array([length for _, length in flat])
 
 
-def evaluate(policy: torch.nn.Module, env: Any, episodes: int, deterministic: bool = True) -> dict[str, float]:
+def evaluate(policy: Any, env: Any, episodes: int, deterministic: bool = True) -> dict[str, float]:
     """``eval/mean_reward``, ``eval/std_reward`` (population) and ``eval/mean_ep_length`` of :func:`play`."""
     rewards, lengths = play(policy, env, episodes, deterministic)
     return {

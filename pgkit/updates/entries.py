@@ -169,6 +169,8 @@ def _missing(chain: Chain, batch: TensorDictBase, key: Any, reader: str) -> str:
             advice = f"{type(chain.advantage).__name__} writes {written}: use one name, or loss.set_keys(...)"
     elif key in _log_prob(chain):
         advice = "the actor should write it: build it with return_log_prob=True"
+    elif key in getattr(chain.loss, "distribution_keys", ()):
+        advice = "a parameter of the distribution that acted: update(loss.keep_distribution(rollout)) writes it"
     else:
         advice = f"{chain.origin(key)} should write it: use one name, or loss.set_keys(...), or in_keys=[...]"
     present = ", ".join(show(k) for k in batch.keys(True, True))

@@ -122,7 +122,7 @@ class OnPolicyUpdate:
         self._follow_schedules()
         length = self.sequence_length or 1
         rows = rollout.numel() // length
-        size = min((self.minibatch_size or rollout.numel()) // length, rows)
+        size = int(min((self.minibatch_size or rollout.numel()) // length, rows))
         results: list[Tensor] = []
         flat, epoch = rollout, 0
         for epoch in range(1, self.epochs + 1):

@@ -18,6 +18,7 @@ from pgkit.compiling import computed_once
 from pgkit.errors import UserError
 from pgkit.updates import optimizers
 from pgkit.updates.chain import is_loss
+from pgkit.updates.constants import Constants
 from pgkit.updates.recorded import Step, recorded
 
 
@@ -73,6 +74,7 @@ class GradientStep:
         self.compile_seconds = 0.0
         self._runs: dict[Any, Step] = {}
         self._coefficients: list[int] = []
+        self._constants: Constants | None = None
         params = optimizers.parameters(optimizer)
         if only is not None:
             kept = {id(p) for reached in only.values() for p in reached}
@@ -109,13 +111,19 @@ class GradientStep:
         self._compile, self._written, self._may_fall_back = compile, written, may_fall_back
 
     def begin(self) -> None:
-        """Reads the learning rates off the optimizer, and looks for coefficients of the loss that were replaced.
+        """Reads the learning rates off the optimizer, and looks for numbers of the loss that were replaced.
 
         Call it before a series of steps.
         """
         coefficients = [id(x) for x in self.loss._buffers.values()]
-        if coefficients != self._coefficients:  # compiled steps hold the former ones
-            self._runs, self._coefficients = {}, coefficients
+        changed = None if self._constants is None else self._constants.changed()
+        if changed:
+            getLogger("pgkit").warning(
+                "the update is compiled again: in the loss %s (a tensor changed by fill_ needs no such thing)",
+                changed,
+            )
+        if changed or coefficients != self._coefficients:  # compiled steps hold the former ones
+            self._runs, self._coefficients, self._constants = {}, coefficients, None
         self._read_learning_rates()
         self.optimizer._opt_called = True  # what torch's schedulers look at before they warn that none stepped
 
@@ -130,9 +138,14 @@ class GradientStep:
             start = time.perf_counter()
             if not self._runs:
                 getLogger("pgkit").info("compiling the update, once: up to 40 seconds, less when it is in the cache")
+            self._constants = constants = Constants(self.loss)
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # the compiler's, on tensordict's and TorchRL's code
                 self._runs[signature], (metrics, grads) = self._build(data, index)
+            if self._runs[signature] is not self._eager and (changed := constants.changed()):
+                reason = f"the loss changes a number of its own as it runs, which is no part of a graph: {changed}"
+                self._fall_back(reason, UserError(f"{reason}; hold it as a tensor, or compile='off'"))
+                self._runs[signature], self._constants = self._eager, None
             self.compile_seconds += time.perf_counter() - start
         if not self._in_graph:
             self._optimizer_step(grads)
@@ -174,11 +187,15 @@ class GradientStep:
             with torch._dynamo.config.patch(trace_autograd_ops=True):
                 return run_compiled, compiled(data, index)
         except torch._dynamo.exc.TorchDynamoException as error:
-            if not self._may_fall_back:
-                raise
-            getLogger("pgkit").warning(
-                "the update cannot be compiled and runs without, several times slower (%s); compile='on' shows the "
-                "whole reason, compile='off' is silent",
-                str(error).strip().splitlines()[0],
-            )
+            self._fall_back(str(error).strip().splitlines()[0], error)
             return self._eager, self._eager(data, index)
+
+    def _fall_back(self, reason: str, error: Exception) -> None:
+        """Says why the step runs as it is from now on, or raises ``error`` where it may not."""
+        if not self._may_fall_back:
+            raise error
+        getLogger("pgkit").warning(
+            "the update cannot be compiled and runs without, several times slower (%s); compile='on' shows the "
+            "whole reason, compile='off' is silent",
+            reason,
+        )

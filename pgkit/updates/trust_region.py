@@ -161,7 +161,7 @@ class TrustRegionUpdate:
         if self._step is None:
             return {}
         self._step.begin()
-        size, results = min(self.minibatch_size or len(flat), len(flat)), []
+        size, results = int(min(self.minibatch_size or len(flat), len(flat))), []
         for _ in range(self.epochs):
             for index in torch.randperm(len(flat), generator=self._generator).to(flat.device or "cpu").split(size):
                 results.append(self._step(flat, index) if len(index) == size else self._step.eager(flat, index))

@@ -2,9 +2,10 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from tensordict.nn import TensorDictModule
+from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 from torchrl.envs import RewardScaling, TransformedEnv
+from torchrl.modules import OrnsteinUhlenbeckProcessModule
 
 from pgkit import collectors, envs, modules
 from pgkit.collectors.policy import trace
@@ -270,3 +271,23 @@ def test_a_choice_whose_mask_allows_nothing_is_refused():
     actor = modules.categorical_actor(env, encoder=modules.dict_encoder({"x": nn.Linear(1, 4)}))
     with pytest.raises(UserError, match="action_mask allows no action"):
         collectors.VectorCollector(env, actor, frames_per_batch=4, compile="off").rollout()
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_state_taken_before_the_first_rollout_is_restored(workers):
+    _, collector = make(workers=workers)
+    state = collector.state_dict()
+    expected = collector.rollout()
+    collector.shutdown()
+    _, other = make(workers=workers)
+    other.load_state_dict(state)
+    assert equal(other.rollout(), expected)
+    other.shutdown()
+
+
+def test_noise_that_is_kept_in_the_tensordict_is_refused():
+    env = envs.make("Pendulum-v1", num_envs=2)
+    noise = OrnsteinUhlenbeckProcessModule(spec=env.action_spec, annealing_num_steps=100)
+    policy = TensorDictSequential(modules.deterministic_actor(env), noise)
+    with pytest.raises(UserError, match="modules.OrnsteinUhlenbeck"):
+        collectors.VectorCollector(env, policy, frames_per_batch=64)

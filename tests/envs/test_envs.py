@@ -248,3 +248,20 @@ def test_an_environment_is_no_maker_of_environments():
             envs.make(env)
     with pytest.raises(UserError, match="gave the same one twice"):
         envs.make(lambda: one, num_envs=2).reset()
+
+
+def test_actions_of_an_integer_box_are_rounded():
+    class Integers(Counter):
+        action_space = spaces.Box(0, 5, (2,), np.int64)
+
+    arrays = envs.make(Integers, seed=1).arrays
+    arrays.reset()
+    arrays.step(np.array([[1.7, 9.0]], np.float32))
+    action = arrays.envs[0].unwrapped.action
+    assert action.dtype == np.int64
+    assert action.tolist() == [2, 5]
+
+
+def test_a_seed_that_is_none_is_refused():
+    with pytest.raises(UserError, match="seed=None: give a whole number"):
+        envs.make("Pendulum-v1", seed=None)  # pyright: ignore[reportArgumentType]

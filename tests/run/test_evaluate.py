@@ -82,3 +82,13 @@ def test_draws_are_evaluated_on_request():
     assert run.evaluate(actor, env, 2)["eval/mean_reward"] == first
     env.set_seed(1)
     assert run.evaluate(actor, env, 2, deterministic=False)["eval/mean_reward"] != first
+
+
+def test_a_loaded_policy_is_evaluated_as_its_actor():
+    env = envs.make("Pendulum-v1", 2, seed=1)
+    actor = modules.gaussian_actor(env)
+    policy = run.Policy(actor, envs.make, (3,), None, None)
+    env.set_seed(1)
+    expected = run.evaluate(actor, env, 2)
+    env.set_seed(1)
+    assert run.evaluate(policy, env, 2) == expected

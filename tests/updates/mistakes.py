@@ -118,6 +118,13 @@ def no_log_probability() -> None:
     agent.train()
 
 
+def no_distribution_of_the_old_policy() -> None:
+    """A loss with a KL penalty has no distribution to measure it from."""
+    agent = Agent()
+    agent.loss = losses.KLPENPPOLoss(agent.actor, agent.critic)
+    agent.train()
+
+
 def random_actions_in_the_rollout() -> None:
     """PPO trains on frames collected with random actions, by ``init_random_frames``."""
     agent = Agent()
@@ -319,7 +326,8 @@ def shared_parameter_twice() -> None:
 
 MISTAKES: list[Callable[[], None]] = [
     no_advantage_block, advantage_under_another_name, advantage_without_the_trailing_1,
-    log_probability_with_a_trailing_1, no_log_probability, random_actions_in_the_rollout, observation_of_another_type,
+    log_probability_with_a_trailing_1, no_log_probability, no_distribution_of_the_old_policy,
+    random_actions_in_the_rollout, observation_of_another_type,
     observation_on_another_device, network_of_another_environment, discrete_actions_for_a_gaussian,
     action_out_of_range, action_outside_the_bounds, reward_without_the_trailing_1, flags_as_numbers,
     parameter_without_optimizer, optimizer_of_another_agent, frozen_parameter_in_the_optimizer, two_critics,

@@ -1,6 +1,7 @@
 from functools import partial
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
@@ -327,3 +328,8 @@ def test_a_key_that_nobody_writes_is_explained(network, key):
     update.loss.set_keys(**({"action": key} if network == "actor" else {"value": key}))
     with pytest.raises(UserError, match=f"'?{key}'?"):
         update(make_rollout())
+
+
+def test_sizes_of_numpy_are_whole_numbers_too():
+    update = make_agent(epochs=1, minibatch_size=np.int64(32))
+    assert update(make_rollout()) == pytest.approx(make_agent(epochs=1, minibatch_size=32)(make_rollout()))
