@@ -101,6 +101,7 @@ def _made_for(buffer: ReplayBuffer) -> dict[str, Any]:
         "environment": buffer.env_name,
         "observation": shapes,
         "action": tuple(buffer.frames["action"].shape[1:]),
+        "entries": {key: tuple(buffer.frames[key].shape[1:]) for key in buffer.entries},
         "num_envs": buffer.columns,
         "n_steps": buffer.n_steps,
         "capacity": buffer.capacity,

@@ -8,6 +8,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+_OWN = {"action", "reward", "terminated", "done", "next_row"}
 Gather = Callable[[TensorDictBase, Tensor], TensorDictBase]
 
 
@@ -45,6 +46,7 @@ def gather(data: TensorDictBase, index: Tensor, *, rows: int, n_steps: int, gamm
         "terminated": terminated,
         "done": done,
     }
+    batch |= {key: x[index] for key, x in frames.items() if key not in _OWN}
     if n_steps > 1:
         batch["steps_to_next_obs"] = steps
     if "weighting" in data.keys():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from logging import getLogger
 from pathlib import Path
@@ -38,6 +38,8 @@ class ReplayBuffer:
         storage: makes a TorchRL storage of so many rows, e.g. :func:`~pgkit.data.in_files` for a
             buffer beyond RAM.
         final_rows: final observations to keep; by default an eighth of the capacity.
+        entries: further entries of the rollouts to keep, with an example of one frame's: ``{"action_log_prob":
+            torch.zeros(())}``. They come back in every batch.
         seed: of the draws; by default drawn from torch's global generator.
     """
 
@@ -50,6 +52,7 @@ class ReplayBuffer:
         sampler: Prioritized | None = None,
         storage: Callable[[int], TensorStorage] = LazyTensorStorage,
         final_rows: int | None = None,
+        entries: Mapping[str, Tensor] | None = None,
         seed: int | None = None,
     ) -> None:
         if not isinstance(env, EnvBase):
@@ -78,6 +81,10 @@ class ReplayBuffer:
             "next_row": torch.zeros((), dtype=torch.int32 if self.rows + self.final_rows < 2**31 else torch.int64),
         }
         observation = {key: spec[key].zero() for key in self.observation_keys}
+        self.entries = list(entries or ())
+        if twice := [key for key in self.entries if key in frame or key in observation]:
+            raise UserError(f"entries={self.entries}: '{twice[0]}' is kept anyway, leave it out")
+        frame |= entries or {}
         frames = _allocate(storage, frame, self.rows)
         observations = _allocate(storage, observation, self.rows + self.final_rows)
         self.frames, self.observations = dict(frames.items()), dict(observations.items(True, True))
@@ -145,6 +152,7 @@ class ReplayBuffer:
             "terminated": rows_of(after, "terminated"),
             "done": done,
             "next_row": rows[columns:],
+            **{key: rows_of(rollout, key) for key in self.entries},
         }.items():
             _write(self.frames[key], self.rows, first, x)
 

@@ -247,3 +247,25 @@ def test_evicted_frames_are_warned_of_once(caplog):
         "observations (2): old frames leave before there are 16; ReplayBuffer(final_rows=...) is that room, as large "
         "as the capacity for frames in no order"
     ]
+
+
+def test_further_entries_are_kept_and_come_back(tmp_path):
+    env = envs.make("Pendulum-v1", num_envs=2, seed=1)
+    made = partial(data.ReplayBuffer, env, 20, entries={"action_log_prob": torch.zeros(()), "cost": torch.zeros(2)})
+    buffer = made()
+    for rollout in rollouts(env, 5, 3):
+        rollout["cost"] = rollout["observation"][..., :2].square()
+        buffer.extend(rollout)
+    batch, actor_log_prob = kept(buffer), rollout["action_log_prob"].T.flatten()
+    torch.testing.assert_close(batch["action_log_prob"][-10:], actor_log_prob)
+    torch.testing.assert_close(batch["cost"], batch["observation"][:, :2].square())
+    buffer.save(tmp_path / "buffer.pt")
+    other = made()
+    other.load(tmp_path / "buffer.pt")
+    assert (kept(other) == batch).all()
+    with pytest.raises(UserError, match="its entries is"):
+        data.ReplayBuffer(env, 20).load(tmp_path / "buffer.pt")
+    with pytest.raises(UserError, match="'reward' is kept anyway"):
+        data.ReplayBuffer(env, 20, entries={"reward": torch.zeros(1)})
+    with pytest.raises(UserError, match="has no 'cost'"):
+        buffer.extend(rollout.exclude("cost"))

@@ -324,6 +324,24 @@ def shared_parameter_twice() -> None:
         agent.train()
 
 
+class Weighted(losses.SACLoss):
+    """Reads how likely the collected action was."""
+
+    def _reads(self) -> list[Any]:
+        return [*super()._reads(), "action_log_prob"]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        behaviour = tensordict["action_log_prob"].mean()
+        return super().forward(tensordict).set("behaviour_entropy", -behaviour)
+
+
+def an_entry_that_the_replay_does_not_keep() -> None:
+    """A loss reads more of the collected frames than a replay buffer keeps by itself."""
+    agent = ReplayAgent()
+    agent.loss = Weighted(agent.loss.actor_network, agent.loss.qvalue_network, gamma=0.99)
+    agent.train()
+
+
 MISTAKES: list[Callable[[], None]] = [
     no_advantage_block, advantage_under_another_name, advantage_without_the_trailing_1,
     log_probability_with_a_trailing_1, no_log_probability, no_distribution_of_the_old_policy,
@@ -333,7 +351,7 @@ MISTAKES: list[Callable[[], None]] = [
     parameter_without_optimizer, optimizer_of_another_agent, frozen_parameter_in_the_optimizer, two_critics,
     two_owners_of_gamma, two_owners_of_gamma_in_the_replay, two_owners_of_lambda, a_loss_a_row, no_loss_entry,
     own_loss_that_broadcasts, flattened_rollout, advantage_of_the_actor, critic_of_two_values, shared_parameter_twice,
-    advantage_with_a_gradient, critics_of_states,
+    advantage_with_a_gradient, critics_of_states, an_entry_that_the_replay_does_not_keep,
 ]  # fmt: skip
 
 
