@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from logging import getLogger
 from typing import Any
 
 import torch
@@ -14,6 +15,7 @@ from pgkit.collectors.policy import Act, check_env, example, output_keys, random
 from pgkit.collectors.stepping import allocate, as_rollout, fill
 from pgkit.collectors.workers import Workers
 from pgkit.compiling import worth_compiling
+from pgkit.constants import Constants
 from pgkit.envs import VectorEnv
 from pgkit.envs.arrays import episode_seed
 from pgkit.errors import UserError, whole
@@ -78,7 +80,7 @@ class VectorCollector:
         self._outputs = dict(zip(self._keys, example(env, actor), strict=True))
         self._workers: Workers | None = None
         self._act: Act | None = None
-        self._traced: list[Any] = []
+        self._constants: Constants | None = None
 
     def __iter__(self) -> Iterator[TensorDictBase]:
         while self.total_frames < 0 or self.frames < self.total_frames:
@@ -120,22 +122,32 @@ class VectorCollector:
         self.env.close_arrays()
 
     def _pool(self) -> Workers:
+        """The workers; they get new weights only, and start again where something else in the actor was replaced."""
+        changed = self._constants.changed(memory=False) if self._workers and self._constants else None
+        state = None
+        if self._workers is not None and changed:
+            getLogger("pgkit").warning(
+                "the workers start again: in the actor %s (a buffer changed in place, by fill_, needs no such thing)",
+                changed,
+            )
+            state = self._workers.state_dict()
+            self._workers.close()
+            self._workers = None
         if self._workers is None:
             start = time.perf_counter()
+            self._constants = Constants(self.actor)
             self._workers = Workers(self.env, self.actor, self._steps, self._outputs, self._compile)
             self.compile_seconds += time.perf_counter() - start
+            if state is not None:
+                self._workers.load_state_dict(state)
         return self._workers
 
     def _policy(self) -> Act:
-        """The traced actor, traced again where its modules, their modes or tensors are not as before."""
-        traced: list[Any] = []
-        for module in self.actor.modules():
-            traced += id(module), module.training
-            tensors = (*module._parameters.values(), *module._buffers.values())
-            traced += [x.data_ptr() for x in tensors if x is not None]
-        if self._act is None or traced != self._traced:
+        """The traced actor, traced again where something that it holds was replaced."""
+        if self._act is None or self._constants is None or self._constants.changed():
             start = time.perf_counter()
             obs = torch.from_numpy(self.env.arrays.obs)
-            self._act, self._traced = trace(self.actor, obs, self._compile, self.env.split), traced
+            self._constants = Constants(self.actor)
+            self._act = trace(self.actor, obs, self._compile, self.env.split)
             self.compile_seconds += time.perf_counter() - start
         return self._act

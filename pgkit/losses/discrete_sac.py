@@ -46,7 +46,8 @@ class DiscreteSACLoss(SoftQLoss):
         num_actions: number of actions.
         target_entropy_weight: with ``target_entropy="auto"``, :math:`\bar H` is this times the largest entropy,
             :math:`\log(\text{actions})`.
-        target_entropy: :math:`\bar H`, or ``auto``.
+        target_entropy: :math:`\bar H`, or ``auto``. Where the actor reads an ``action_mask``, that of a state is
+            :math:`\bar H \log(\text{allowed}) / \log(\text{actions})`.
         form: ``expectation`` or ``gumbel_softmax``.
         relaxation: temperature of the relaxation, for ``gumbel_softmax``.
         loss_function: ``l2``, ``l1`` or ``smooth_l1``.
@@ -137,7 +138,16 @@ class DiscreteSACLoss(SoftQLoss):
         actor_loss = -expected_soft_value(weights, log_prob, self.actor_value(q_all.detach().mT), alpha)
         if self._target_entropy is None:
             self._target_entropy = self.target_entropy_weight * log(log_prob.shape[-1])
-        return self.result(batch, actor_loss, qvalue_loss, weights, (weights * log_prob).sum(-1), q)
+        entropy = -(weights * log_prob).sum(-1)
+        return self.result(batch, actor_loss, qvalue_loss, weights, -entropy, q, self.out_of_reach(log_prob))
+
+    def out_of_reach(self, log_prob: Tensor) -> Tensor | float:
+        """What an action mask takes off the target entropy, ``[*B]``; ``log_prob [*B, actions]``."""
+        target = self._target_entropy if self.temperature is None else getattr(self.temperature, "target_entropy", None)
+        if target is None or "action_mask" not in self.actor_network.in_keys:
+            return 0.0
+        allowed = (log_prob.detach() > -1e5).sum(-1)
+        return target * (1 - allowed.log() / log(log_prob.shape[-1]))
 
 
 def _chosen(q: Tensor, action: Tensor) -> Tensor:

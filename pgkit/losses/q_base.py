@@ -152,10 +152,12 @@ class QLoss(Loss):
                 out = out.unsqueeze(-2 if self.head.size > 1 and self.num_critics == 1 else -1)
         if (out.shape[-1] > 1) != (self.head.size > 1) or out.shape[-2] != (number or out.shape[-2]):
             outputs = "one output" if self.head.size == 1 else f"{self.head.size} outputs"
+            advice = f"give the critics the head (modules.q_value(env, {self.num_critics}, head=...))"
+            if self.head.size == 1:
+                advice += f", or, if one network writes several critics' values, network.num_critics = {out.shape[-1]}"
             raise UserError(
                 f"{self.head} needs {outputs} of each of the {self.num_critics} critics, there are "
-                f"{out.shape[-1]} of {out.shape[-2]}: give the critics the head (modules.q_value(env, "
-                f"{self.num_critics}, head=...))"
+                f"{out.shape[-1]} of {out.shape[-2]}: {advice}"
             )
         return out if members is None else out[..., members, :]
 

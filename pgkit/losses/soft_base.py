@@ -143,14 +143,24 @@ class SoftQLoss(QLoss):
         return temperature_loss(self.log_alpha, log_prob, self._target_entropy)
 
     def result(
-        self, batch: TensorDictBase, actor: Tensor, qvalue: Tensor, action: Tensor, log_prob: Tensor, q: Tensor
+        self,
+        batch: TensorDictBase,
+        actor: Tensor,
+        qvalue: Tensor,
+        action: Tensor,
+        log_prob: Tensor,
+        q: Tensor,
+        out_of_reach: Tensor | float = 0.0,
     ) -> TensorDict:
-        """The three losses of the unreduced ``[*B]``, and the metrics; ``log_prob [*B]`` is that of ``action``."""
+        """The three losses of the unreduced ``[*B]``, and the metrics; ``log_prob [*B]`` is that of ``action``.
+
+        ``out_of_reach [*B]`` is the part of the target entropy that is not asked of a row.
+        """
         out = TensorDict(
             {
                 "loss_actor": self.reduce(actor, batch),
                 "loss_qvalue": self.reduce(qvalue, batch),
-                "loss_alpha": self.reduce(self.temperature_loss(action, log_prob), batch),
+                "loss_alpha": self.reduce(self.temperature_loss(action, log_prob - out_of_reach), batch),
             }
         )
         out["alpha"], out["entropy"], out["q_value"] = self.alpha, -log_prob.detach().mean(), q.detach().mean()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDictBase
@@ -34,7 +34,8 @@ def estimated(
             )
         return result
     key = getattr(getattr(loss, "tensor_keys", None), "advantage", None)
-    if key is None or key in rollout.keys(True) or not hasattr(loss, "actor_network"):
+    unread = hasattr(loss, "_reads") and key not in cast(Any, loss).in_keys  # pgkit's losses name all that they read
+    if key is None or unread or key in rollout.keys(True) or not hasattr(loss, "actor_network"):
         return rollout
     estimator: Any = getattr(loss, "_value_estimator", None)
     if estimator is None:

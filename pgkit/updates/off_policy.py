@@ -14,7 +14,7 @@ from pgkit.data import ReplayBuffer
 from pgkit.errors import UserError, whole, within
 from pgkit.updates import optimizers, restoring, wiring
 from pgkit.updates.batches import Batches, OwnBatches, TorchRLBatches
-from pgkit.updates.chain import Chain
+from pgkit.updates.chain import Chain, is_loss
 from pgkit.updates.diagram import diagram
 from pgkit.updates.step import GradientStep
 from pgkit.updates.targets import averaging, copying
@@ -33,7 +33,8 @@ class OffPolicyUpdate:
         optimizer: any ``torch.optim`` optimizer; its groups may have learning rates of their own.
         batch_size: rows of a batch.
         updates_per_step: gradient steps for each frame collected; a fraction such as 0.5 adds up.
-        actor_delay: the losses other than the critics' join every so many steps (2 in TD3).
+        actor_delay: the losses other than the critics' join every so many steps (2 in TD3). The critics' are
+            ``loss_qvalue``, ``loss_value``, ``loss_critic``, and what trains nothing but their parameters.
         delay_targets: the target networks move only in the steps in which those other losses join, as in TD3.
         tau: share of the trained parameters that the targets take over at each step.
         learning_starts: frames in the replay before the first step, at least ``batch_size``.
@@ -200,15 +201,17 @@ class OffPolicyUpdate:
             self._steps[False] = GradientStep(self.loss, self.optimizer, names, only=only, **settings)
 
     def _critics(self, batch: TensorDictBase) -> dict[str, list[Tensor]]:
-        """The critics' loss entries, and the parameters they train."""
+        """The critics' loss entries, and the parameters they train: by name, and whatever trains no others."""
         params = optimizers.parameters(self.optimizer)
 
         def trial() -> dict[str, list[Tensor]]:
             out, reached = self.loss(batch.copy()), {}
-            for key in [key for key in ("loss_qvalue", "loss_value", "loss_critic") if key in out.keys()]:
+            for key in filter(is_loss, out.keys()):
                 grads = torch.autograd.grad(out[key].sum(), params, allow_unused=True, retain_graph=True)
                 reached[key] = [p for p, grad in zip(params, grads, strict=True) if grad is not None]
-            return reached
+            named = [key for key in ("loss_qvalue", "loss_value", "loss_critic") if key in reached]
+            critics = {id(p) for key in named for p in reached[key]}
+            return {key: held for key, held in reached.items() if held and all(id(p) in critics for p in held)}
 
         reached = restoring.undone(self.loss.buffers(), trial)
         if not reached:

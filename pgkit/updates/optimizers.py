@@ -88,8 +88,9 @@ def functional(optimizer: Any, fused: bool, params: list[Tensor] | None = None) 
     None for any other optimizer, and for SGD with dampening.
 
     ``apply(grads)`` takes one gradient a parameter, in the order of :func:`parameters`, and can be traced.
-    ``read_learning_rates()`` copies the groups' ``lr`` into the tensors ``rates`` that the trace uses: annealing an
-    ``lr`` never recompiles. Adam moments and counters are made here if the optimizer has none yet.
+    ``read_learning_rates()`` copies the groups' ``lr`` into the tensors ``rates`` that the trace uses, and a state
+    that was reset (``optimizer.state.clear()``) into the tensors that it has: neither recompiles. Adam moments and
+    counters are made here if the optimizer has none yet.
 
     Args:
         optimizer: of exactly one of the classes above.
@@ -112,6 +113,7 @@ def functional(optimizer: Any, fused: bool, params: list[Tensor] | None = None) 
     applies = [make(optimizer, group, rate, fused) for group, rate in zip(groups, rates, strict=True)]
 
     state, names = optimizer.state, [name for name in optimizer.defaults if name != "lr"]
+    held = [(p, name, x) for g in groups for p in g["params"] for name, x in state[p].items() if torch.is_tensor(x)]
 
     def read_learning_rates() -> None:
         if optimizer.state is not state:
@@ -119,6 +121,11 @@ def functional(optimizer: Any, fused: bool, params: list[Tensor] | None = None) 
                 "the optimizer was loaded after its first step in this update: load it before, or load the update's "
                 "own state (update.load_state_dict)"
             )
+        for p, name, tensor in held:  # a state that was reset or replaced goes on in the tensors that the step has
+            now = state[p].get(name)
+            if now is not tensor:
+                tensor.copy_(now) if torch.is_tensor(now) else tensor.zero_()
+                state[p][name] = tensor
         for source, group, rate in zip(sources, groups, rates, strict=True):
             if changed := [name for name in names if source.get(name) != group.get(name)]:
                 raise UserError(

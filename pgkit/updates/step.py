@@ -15,10 +15,10 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from pgkit.compiling import computed_once
+from pgkit.constants import Constants
 from pgkit.errors import UserError
 from pgkit.updates import optimizers
 from pgkit.updates.chain import is_loss
-from pgkit.updates.constants import Constants
 from pgkit.updates.recorded import Step, recorded
 
 
@@ -73,7 +73,6 @@ class GradientStep:
         self.names = [*names, "grad_norm"]
         self.compile_seconds = 0.0
         self._runs: dict[Any, Step] = {}
-        self._coefficients: list[int] = []
         self._constants: Constants | None = None
         params = optimizers.parameters(optimizer)
         if only is not None:
@@ -111,21 +110,28 @@ class GradientStep:
         self._compile, self._written, self._may_fall_back = compile, written, may_fall_back
 
     def begin(self) -> None:
-        """Reads the learning rates off the optimizer, and looks for numbers of the loss that were replaced.
+        """Reads the learning rates off the optimizer, and looks for what was replaced in the loss.
 
         Call it before a series of steps.
+
+        Raises:
+            UserError: a parameter of the optimizer was frozen, or a setting of it other than ``lr`` was changed.
         """
-        coefficients = [id(x) for x in self.loss._buffers.values()]
+        if not all(p.requires_grad for p in self._params):
+            raise UserError(
+                "a parameter of the optimizer was frozen after the first step (requires_grad is False): what is "
+                "trained is decided when an update is built, build a new one with an optimizer of the others"
+            )
         changed = None if self._constants is None else self._constants.changed()
         if changed:
             getLogger("pgkit").warning(
-                "the update is compiled again: in the loss %s (a tensor changed by fill_ needs no such thing)",
+                "the update is compiled again: in the loss %s (what changes in place, by fill_, needs no such thing)",
                 changed,
             )
-        if changed or coefficients != self._coefficients:  # compiled steps hold the former ones
-            self._runs, self._coefficients, self._constants = {}, coefficients, None
+            self._runs, self._constants = {}, None
         self._read_learning_rates()
-        self.optimizer._opt_called = True  # what torch's schedulers look at before they warn that none stepped
+        for part in getattr(self.optimizer, "parts", [self.optimizer]):
+            part._opt_called = True  # what torch's schedulers look at before they warn that none stepped
 
     def __call__(self, data: TensorDictBase, index: Tensor) -> Tensor:
         """One step on the rows ``index`` of ``data``; metrics ``[len(names)]``, still on the device."""

@@ -2,7 +2,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from tensordict.nn import TensorDictModule, TensorDictSequential
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import nn
 from torchrl.envs import RewardScaling, TransformedEnv
 from torchrl.modules import OrnsteinUhlenbeckProcessModule
@@ -291,3 +291,34 @@ def test_noise_that_is_kept_in_the_tensordict_is_refused():
     policy = TensorDictSequential(modules.deterministic_actor(env), noise)
     with pytest.raises(UserError, match="modules.OrnsteinUhlenbeck"):
         collectors.VectorCollector(env, policy, frames_per_batch=64)
+
+
+class Annealed(TensorDictModuleBase):
+    """An actor with noise whose size is a plain number."""
+
+    def __init__(self, actor):
+        super().__init__()
+        self.actor, self.std = actor, 0.5
+        self.in_keys, self.out_keys = actor.in_keys, actor.out_keys
+
+    def forward(self, tensordict):
+        out = self.actor(tensordict)
+        out["action"] = out["action"] + self.std * torch.randn_like(out["action"])
+        return out
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_number_of_the_actor_that_changes_takes_effect(workers, caplog):
+    env = envs.make("Pendulum-v1", num_envs=2, seed=1, workers=workers)
+    actor = modules.deterministic_actor(env, (8,))
+    noisy = Annealed(actor)
+    collector = collectors.VectorCollector(env, noisy, frames_per_batch=40, compile="off")
+    first = collector.rollout()
+    noisy.std = 0.0
+    second = collector.rollout()
+    collector.shutdown()
+    for rollout, exact in ((first, False), (second, True)):
+        action = rollout["action"].clone()
+        assert torch.allclose(action, actor(rollout.clone())["action"], atol=1e-6) == exact
+    assert torch.equal(second["observation"][:, 0], first["next", "observation"][:, -1])  # the episodes go on
+    assert ("workers start again" in caplog.text) == (workers > 1)

@@ -43,8 +43,8 @@ Row = tuple[spaces.Space, spaces.Space, Callable[..., Any], bool, Callable[[], n
 actor_of, gaussian, NONE = modules.categorical_actor, modules.gaussian_actor, None
 # what: ((observation, action, builder, flatten, encoder), how)
 ROWS: dict[str, tuple[Row, str]] = {
-    "observation: Box": ((BOX, CHOICE, actor_of, True, NONE), "as it is"),
-    "observation: Box, image": ((DICT["picture"], CHOICE, actor_of, True, picture), "`encoder=`"),
+    "observation: Box": ((BOX, CHOICE, actor_of, True, NONE), "as it is, in float32"),
+    "observation: Box, image": ((DICT["picture"], CHOICE, actor_of, True, picture), "`encoder=`, which divides by 255"),
     "observation: Discrete": ((spaces.Discrete(3), CHOICE, actor_of, True, NONE), "becomes one-hot"),
     "observation: MultiDiscrete": ((spaces.MultiDiscrete([2, 3]), CHOICE, actor_of, True, NONE), "one-hots, joined"),
     "observation: MultiBinary": ((spaces.MultiBinary(3), CHOICE, actor_of, True, NONE), "as it is"),

@@ -303,3 +303,20 @@ def test_a_list_of_single_critics_is_an_ensemble_of_them():
     index = torch.tensor([2, 0])
     torch.testing.assert_close(loss.action_values(data, loss.qvalue_network_params, index), expected[:, index])
     assert loss(data)["loss_qvalue"] > 0
+
+
+@pytest.mark.parametrize("given", [True, False])
+def test_under_a_mask_the_target_entropy_is_that_of_the_allowed_actions(given):
+    env = envs.make(Masked, num_envs=2, seed=1, flatten=False)  # two of four actions are allowed
+    actor = modules.categorical_actor(env, (8,))
+    temperature = controllers.Temperature(0.5 * math.log(4)) if given else None
+    loss = losses.DiscreteSACLoss(
+        actor, modules.discrete_q_value(env, hidden=(8,)), temperature=temperature, num_actions=4,
+        target_entropy_weight=0.5, delay_qvalue=False,
+    )  # fmt: skip
+    rollout = collectors.VectorCollector(env, actor, frames_per_batch=32).rollout().reshape(-1)
+    log_alpha = loss.log_alpha if temperature is None else temperature.log_alpha
+    with torch.no_grad():
+        log_alpha.fill_(1.0)
+    out = loss(rollout)
+    torch.testing.assert_close(out["loss_alpha"], out["entropy"] - 0.5 * math.log(2))

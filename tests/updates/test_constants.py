@@ -1,4 +1,4 @@
-"""Plain numbers and functions of a loss in a compiled step."""
+"""What a loss holds besides its parameters, in a compiled step."""
 
 from functools import partial
 from typing import Any
@@ -7,8 +7,8 @@ import pytest
 import torch
 from torch import nn
 
+from pgkit.constants import Constants
 from pgkit.errors import UserError
-from pgkit.updates.constants import Constants
 from tests.updates.test_on_policy import make_agent, make_rollout, parameters
 
 BOUND = 0.1
@@ -61,18 +61,60 @@ def test_every_place_of_a_number_is_seen(monkeypatch):
         assert "power' went from" in str(constants.changed())
 
 
-def test_a_number_that_changes_between_updates_takes_effect_with_a_word(caplog):
+class Own(nn.Module):
+    """Holds things in many ways."""
+
+    def __init__(self):
+        super().__init__()
+        self.table, self.row, self.name, self._hidden = {"weight": 1.0}, [1.0, 2.0], "a", 1.0
+        self.scale, self.net, self.log = torch.tensor(1.0), nn.Linear(2, 2), []
+        self.register_buffer("beta", torch.tensor(1.0))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda own: own.table.update(weight=2.0), "'table.weight' went from 1.0 to 2.0"),
+        (lambda own: own.row.__setitem__(1, 3.0), "'row.1' went from 2.0 to 3.0"),
+        (lambda own: setattr(own, "name", "b"), "'name' went from a to b"),
+        (lambda own: setattr(own, "_hidden", 2.0), "'_hidden' went from 1.0 to 2.0"),
+        (lambda own: setattr(own, "scale", torch.tensor(2.0)), "'scale' went from one Tensor to one Tensor"),
+        (lambda own: setattr(own, "beta", own.beta * 2), "'beta' went from one Tensor to one Tensor"),
+        (lambda own: setattr(own, "net", nn.Linear(2, 2)), "'net' went from one Linear to one Linear"),
+        (lambda own: setattr(own.net.weight, "data", own.net.weight.data * 2), "memory of a parameter or buffer"),
+        (lambda own: own.net.weight.data.mul_(2), None),
+        (lambda own: own.scale.fill_(2.0), None),
+        (lambda own: own.log.append(1.0), None),
+    ],
+)
+def test_what_is_replaced_is_seen_and_what_is_written_into_is_not(change, message):
+    own = Own()
+    constants = Constants(own)
+    assert constants.changed() is None
+    change(own)
+    if message is None:
+        assert constants.changed() is None
+    else:
+        assert message in str(constants.changed())
+        assert "memory" in message or message in str(constants.changed(memory=False))
+
+
+def test_what_changes_between_updates_takes_effect_with_a_word(caplog):
     compiled, eager = (make_agent(compile=c, epochs=1, dtype=torch.float64) for c in ("on", "off"))
     scale = 1.0
     for update in (compiled, eager):
         update.loss.surrogate = lambda log_ratio, advantage: scale * log_ratio.exp() * advantage
-    for i, scale in enumerate((1.0, 1.0, 0.25)):  # noqa: B007, the surrogate reads it
-        assert "compiled again" not in caplog.text
+    for i, scale in enumerate((1.0, 1.0, 0.25, 0.25)):  # noqa: B007, the surrogate reads it
+        assert ("compiled again" in caplog.text) == (i == 3)
+        if i == 3:  # weights are shrunk, by new memory
+            for p in (p for update in (compiled, eager) for p in update.loss.parameters()):
+                p.data = 0.8 * p.data
         rollout = make_rollout(i, torch.float64)
         for update in (compiled, eager):
             update(rollout.clone())
         torch.testing.assert_close(parameters(compiled), parameters(eager), rtol=0, atol=1e-5)
     assert "compiled again: in the loss 'surrogate.scale' went from 1.0 to 0.25" in caplog.text
+    assert "compiled again: in the loss the memory of a parameter" in caplog.text
 
 
 def test_a_loss_that_counts_is_not_compiled(caplog):

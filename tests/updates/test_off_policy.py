@@ -420,3 +420,25 @@ def test_a_state_of_other_shapes_is_refused():
         made.append(updates.OffPolicyUpdate(loss, data.ReplayBuffer(env, 2000), torch.optim.Adam(loss.parameters())))
     with pytest.raises(ValueError, match=r"qvalue_network.* is \(2, 8, 1\) there and \(2, 8, 5\) here"):
         made[1].load_state_dict(made[0].state_dict())
+
+
+class Conservative(losses.SACLoss):
+    """A term more for the critics, and one for the actor."""
+
+    def forward(self, tensordict):
+        out = super().forward(tensordict)
+        out["loss_conservative"] = self.q(tensordict, tensordict["action"], self.qvalue_network_params).mean()
+        out["loss_prior"] = self.actor_network_params.flatten_keys().values().__iter__().__next__().square().mean()
+        return out
+
+
+def test_a_term_that_trains_the_critics_alone_is_not_delayed_with_the_actor():
+    update, collector = agent(actor_delay=2)
+    update.loss = Conservative(collector.actor, update.loss.qvalue_network, gamma=0.9)
+    update.optimizer = torch.optim.Adam(update.loss.parameters(), lr=1e-2)
+    update._average = averaging(update.loss, 0.005)
+    for _ in range(2):
+        update.buffer.extend(collector.rollout())
+    update.train(1)
+    between = update.train(1)
+    assert {name for name in between if name.startswith("loss_")} == {"loss_qvalue", "loss_conservative"}

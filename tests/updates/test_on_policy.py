@@ -333,3 +333,45 @@ def test_a_key_that_nobody_writes_is_explained(network, key):
 def test_sizes_of_numpy_are_whole_numbers_too():
     update = make_agent(epochs=1, minibatch_size=np.int64(32))
     assert update(make_rollout()) == pytest.approx(make_agent(epochs=1, minibatch_size=32)(make_rollout()))
+
+
+@pytest.mark.parametrize("compile", ["off", "on"])
+def test_a_reset_of_the_optimizer_s_state_begins_again(compile):
+    update = make_agent(compile=compile, epochs=1)
+    fresh = make_agent(compile=compile, epochs=1)
+    update(make_rollout(0))
+    fresh.loss.load_state_dict(update.loss.state_dict())
+    fresh._generator.set_state(update._generator.get_state())
+    update.optimizer.state.clear()
+    assert update(make_rollout(1)) == pytest.approx(fresh(make_rollout(1)), rel=1e-5, abs=1e-6)
+    torch.testing.assert_close(parameters(update), parameters(fresh))
+    for a, b in zip(update.optimizer.state.values(), fresh.optimizer.state.values(), strict=True):
+        assert a["step"] == b["step"] == 4
+        torch.testing.assert_close(a["exp_avg"], b["exp_avg"])
+
+
+def test_freezing_after_the_first_update_is_refused():
+    update = make_agent()
+    update(make_rollout())
+    next(iter(update.optimizer.param_groups[0]["params"])).requires_grad_(False)
+    with pytest.raises(UserError, match="was frozen after the first step"):
+        update(make_rollout())
+
+
+class Cloning(losses.PolicyLoss):
+    """Behaviour cloning."""
+
+    def _reads(self):
+        return [*self.actor_network.in_keys, "action"]
+
+    def forward(self, tensordict):
+        log_prob = self.distribution(tensordict).log_prob(tensordict["action"])
+        return TensorDict({"loss_cloning": -log_prob.mean()})
+
+
+def test_a_loss_of_the_policy_that_reads_no_advantage_needs_none():
+    env = envs.make("Pendulum-v1")
+    loss = Cloning(modules.gaussian_actor(env))
+    update = updates.OnPolicyUpdate(loss, None, torch.optim.Adam(loss.parameters(), lr=1e-2), epochs=4, compile="off")
+    rollout = make_rollout()
+    assert update(rollout)["loss_cloning"] > update(rollout)["loss_cloning"]
