@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from pgkit.compiling import check_compile, worth_compiling
+from pgkit.constants import Constants
 from pgkit.errors import UserError, whole, within
 from pgkit.functional import standardize
 from pgkit.updates import restoring, wiring
@@ -109,6 +110,7 @@ class OnPolicyUpdate:
         self._keys: list[Any] = []
         self._old: list[Any] = []  # of these, what losses measure a change from: as before the first epoch
         self._estimate: Block | None = None
+        self._held: Constants | None = None  # what a recorded advantage block holds
         self._estimate_seconds = 0.0
         self._batch: TensorDictBase | None = None
 
@@ -180,7 +182,7 @@ class OnPolicyUpdate:
 
     def _flatten(self, rollout: TensorDictBase) -> TensorDictBase:
         """The advantage, then the entries that the loss reads as ``[rows, ...]``."""
-        if self.advantage is not None and self._estimate is None:
+        if self.advantage is not None and (self._estimate is None or (self._held and self._held.changed())):
             self._estimate = self._prepare(self.advantage, rollout)
         rollout = estimated(self.loss, self._estimate, rollout)
         if self._step is None:
@@ -197,6 +199,7 @@ class OnPolicyUpdate:
         if not (few and getattr(advantage, "recordable", False) and worth_compiling(self.compile, rollouts, 5_000)):
             return advantage
         start = time.perf_counter()
+        self._held = Constants(cast(nn.Module, advantage))
         try:
             return recorded_block(cast(TensorDictModuleBase, advantage), rollout)
         except (RuntimeError, KeyError) as error:  # KeyError: it reads an entry that its in_keys leave out
