@@ -108,6 +108,8 @@ def main(args: Args) -> None:
         actions = getattr(env.action_spec_unbatched.space, "n", None)
         if actions is None:
             raise UserError(f"rainbow needs one discrete action, '{args.env_id}' has another action space: use sac")
+        if args.v_min >= args.v_max:
+            raise UserError(f"--v-min {args.v_min:g} --v-max {args.v_max:g}: give a least return below the largest")
         sizes = (env.observation_spec_unbatched["observation"].shape[-1], actions)
         net = DuelingNoisyNet(*sizes, args.atoms, args.hidden, args.noise)
         actor = DistributionalQValueActor(

@@ -117,19 +117,30 @@ class BesideCheckpoint:
         buffer: the replay buffer.
         path: its file.
         save: write that file with every checkpoint; otherwise a resumed run fills an empty buffer first, and says so.
+
+    There are two files in turn, ``buffer.pt`` and ``buffer-2.pt``: until a checkpoint is written whole, the one before
+    has its own.
     """
 
     def __init__(self, buffer: ReplayBuffer, path: Path, save: bool) -> None:
         self.buffer, self.path, self.save = buffer, path, save
 
     def state_dict(self) -> dict[str, Any]:
-        """The number of frames; writes the file."""
+        """The number of frames and the file's name; writes the file."""
+        state = {"written": self.buffer.written, "saved": self.save, "generator": self.buffer.generator.get_state()}
         if self.save:
+            self._other()
             save(self.buffer, self.path)
-        return {"written": self.buffer.written, "saved": self.save, "generator": self.buffer.generator.get_state()}
+            state["file"] = self.path.name
+        return state
+
+    def _other(self) -> None:
+        first = self.path.with_stem(self.path.stem.removesuffix("-2"))
+        self.path = first.with_stem(first.stem + "-2") if self.path == first and first.exists() else first
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Reads the file that belongs to the checkpoint, if there is one."""
+        self.path = self.path.with_name(state.get("file", self.path.name))
         if state["saved"] and self.save and self.path.is_file():
             load(self.buffer, self.path)
             if self.buffer.written == state["written"]:

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
+
+from pgkit.errors import UserError
 
 BLOCK = 64
 
@@ -33,7 +37,10 @@ class SumTree:
 
     def find(self, share: Tensor) -> Tensor:
         """For shares of the total, ``[B]`` in [0, 1): the index where the running sum first exceeds each."""
-        block, mass = _find(self.sums.cumsum(0), share.double() * self.sums.sum())
+        total = self.sums.sum()
+        if not math.isfinite(total):
+            raise UserError(f"the replay's priorities sum to {total:g}: training diverged, lower the learning rates")
+        block, mass = _find(self.sums.cumsum(0), share.double() * total)
         inner = self.values.view(-1, BLOCK)[block].cumsum(-1)
         child, _ = _find(inner, mass.unsqueeze(-1))
         return block * BLOCK + child.squeeze(-1)

@@ -103,7 +103,7 @@ class ArrayEnv:
         for i, env in enumerate(self.envs):
             result = env.step(actions[i])
             if not self._stepped:
-                check_step(env, result)
+                check_step(env, actions[i], result)
             obs, reward, terminated, truncated, _ = result
             self._write(self._next_obs[i], obs)
             self._reward[i], self._terminated[i], self._truncated[i] = reward, terminated, truncated

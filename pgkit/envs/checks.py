@@ -28,8 +28,10 @@ def checked_reset(env: gym.Env, seed: int) -> tuple[Any, dict[str, Any]]:
     return result
 
 
-def check_step(env: gym.Env, result: Any) -> None:
-    """A ``UserError`` where what ``env.step`` returned is not as Gymnasium asks."""
+def check_step(env: gym.Env, action: np.ndarray, result: Any) -> None:
+    """A ``UserError`` where what ``env.step(action)`` returned is not as Gymnasium asks, or the action is NaN."""
+    if not np.isfinite(action).all():
+        raise UserError(f"the policy's action is {action}: its weights or its log_std are not finite")
     if not (isinstance(result, tuple) and len(result) == 5):
         raise UserError(
             f"{_name(env)}.step returned {_kind(result)}: return the tuple (observation, reward, terminated, "

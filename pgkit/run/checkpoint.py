@@ -41,7 +41,7 @@ def load(path: Path) -> Any:
             f"{path} needs code that is not found ({error}): run this where the recipe's own modules are, or put their "
             "folder on PYTHONPATH"
         ) from error
-    except (RuntimeError, EOFError, pickle.UnpicklingError) as error:
+    except (RuntimeError, EOFError, OSError, pickle.UnpicklingError) as error:
         raise UserError(f"{path} is damaged: {str(error).splitlines()[0]}") from error
 
 

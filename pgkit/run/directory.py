@@ -63,6 +63,39 @@ def write_config(path: Path, args: RunArgs, recipe: str, resumed_at: list[int]) 
     write_json(path / "config.json", config)
 
 
+def lock(path: Path) -> int | None:
+    """Takes the directory for this process until :func:`unlock`; a UserError if another has it. None on Windows."""
+    try:
+        import fcntl
+    except ImportError:
+        return None
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(handle)
+        raise UserError(f"{path}: another process goes on with this run; wait for it, or stop it") from None
+    except OSError:  # a file system without locks
+        pass
+    return handle
+
+
+def unlock(handle: int | None) -> None:
+    """Gives back what :func:`lock` took."""
+    if handle is not None:
+        os.close(handle)
+
+
+def remove_if_bare(path: Path) -> None:
+    """Removes what a run wrote that ended before its first row, and the directory if nothing else is in it."""
+    if (path / "metrics.csv").exists() or (path / "checkpoints").exists():
+        return
+    for file in [path / "config.json", *path.glob("events.out.tfevents.*")]:
+        file.unlink(missing_ok=True)
+    if not any(path.iterdir()):
+        path.rmdir()
+
+
 def read_config(path: Path) -> dict[str, Any]:
     """``config.json`` of a run directory; a UserError if there is none."""
     if not (path / "config.json").is_file():

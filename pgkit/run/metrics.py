@@ -15,10 +15,10 @@ from pgkit.errors import UserError
 
 
 def read_csv(path: Path) -> tuple[list[str], list[dict[str, str]]]:
-    """The header and the rows of a metrics file, as text."""
+    """The header and the whole rows of a metrics file, as text: a line that was cut short is left out."""
     with path.open(newline="") as file:
         reader = csv.DictReader(file)
-        return list(reader.fieldnames or []), list(reader)
+        return list(reader.fieldnames or []), [row for row in reader if None not in row and None not in row.values()]
 
 
 def column(rows: list[dict[str, str]], name: str) -> list[tuple[float, float]]:

@@ -53,6 +53,8 @@ def plot(run_dirs: Sequence[str | Path], out: str | Path, x: Literal["frames", "
         axes.grid(alpha=0.3)
         if axes.get_legend_handles_labels()[0]:
             axes.legend(frameon=False)
+    if Path(out).is_dir():
+        raise UserError(f"cannot write {out}: it is a directory, give a file name in it")
     try:
         figure.savefig(out, dpi=150)
     except (OSError, ValueError) as error:
@@ -108,9 +110,11 @@ def _draw(axes: Any, curves: list[Curve], label: str, **style: Any) -> None:
     if not curves:
         return
     frames, mean, deviation = mean_and_band(curves)
-    if not len(frames):
+    if not len(frames):  # nowhere do all have values
+        for curve in curves:
+            axes.plot(*zip(*curve, strict=True), label=label if curve is curves[0] else None, **style)
         return
-    axes.plot(frames, mean, label=label, **style)
+    axes.plot(frames, mean, label=label, **({"marker": "o"} if len(frames) == 1 else {}) | style)
     if len(curves) > 1:
         axes.fill_between(frames, mean - deviation, mean + deviation, color=style["color"], alpha=0.15, linewidth=0)
 

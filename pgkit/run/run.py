@@ -33,9 +33,9 @@ NAN = float("nan")
 class Run:
     """Seeds on entry, writes the run directory, ends with an evaluation, a summary and a curve.
 
-    Nothing is written before :meth:`track`, so a bad setting leaves no directory behind. Ctrl-C lets the
-    running update finish, saves ``latest`` and ends the run; a second Ctrl-C ends it at once. One during an evaluation
-    ends that, and a failed evaluation ends the run: both after ``latest`` is saved.
+    Nothing is written before :meth:`track`, and a run that ends before its first row leaves no directory behind. Ctrl-C
+    (or SIGTERM) lets the running update finish, saves ``latest`` and ends the run; a second one ends it at once. One
+    during an evaluation ends that, and a failed evaluation ends the run: both after ``latest`` is saved.
 
     Raises:
         UserError: the directory holds a run; or the resumed one has no checkpoint, is another recipe's, or
@@ -57,6 +57,7 @@ class Run:
         self._tracked: dict[str, checkpoint.Stateful] = {}
         self._eval: Any = None
         self._interrupted = self._diverged = self._evaluating = False
+        self._lock: int | None = None
 
     def _load(self) -> dict[str, Any]:
         config = directory.read_config(self.dir)
@@ -77,7 +78,7 @@ class Run:
         torch.set_num_threads(self.args.threads)
         seeding.seed_everything(self.args.seed)
         if threading.current_thread() is threading.main_thread():
-            self._handler = signal.signal(signal.SIGINT, self._interrupt)
+            self._handlers = {s: signal.signal(s, self._interrupt) for s in (signal.SIGINT, signal.SIGTERM)}
         return self
 
     def track(self, *, policy: torch.nn.Module, eval_env: Callable[..., Any], **stateful: checkpoint.Stateful) -> None:
@@ -101,12 +102,14 @@ class Run:
             raise SystemExit(0)
         resumed_at = []
         if self._saved:
+            self._lock = directory.lock(self.dir)
             checkpoint.restore(tracked, self._saved["states"], self.dir / "checkpoints" / "latest.pt")
             seeding.set_rng_state(self._saved["rng"])
             resumed_at = [*directory.read_config(self.dir)["resumed_at"], self.frames]
         self._policy, self._make_env = policy, eval_env
         self._eval_env()  # what is wrong with it shows before the training, not after
         directory.write_config(self.dir, self.args, self.recipe, resumed_at)
+        self._lock = self._lock or directory.lock(self.dir)
         self._metrics = Metrics(self.dir, upto=self.frames)
         self._live = Live(self.args.total_frames, self.frames)
         self._tracked = tracked
@@ -225,14 +228,16 @@ class Run:
                     "wall_s": self._clock.wall,
                 },
             }
-            checkpoint.save(folder / "latest.pt", content)
-            if self.best.get("frames") == self.frames:
+            if self.best.get("frames") == self.frames:  # first: latest says that there is one
                 checkpoint.save(folder / "best.pt", content)
+            checkpoint.save(folder / "latest.pt", content)
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
         if threading.current_thread() is threading.main_thread():
-            signal.signal(signal.SIGINT, self._handler)
+            for number, handler in self._handlers.items():
+                signal.signal(number, handler)
         if not self._tracked:
+            directory.unlock(self._lock)
             return
         try:
             if kind is None:
@@ -240,6 +245,9 @@ class Run:
         finally:
             self._live.close()
             self._metrics.close()
+            if not self._saved:
+                directory.remove_if_bare(self.dir)
+            directory.unlock(self._lock)
             if self._eval is not None:
                 self._eval.close()
         if kind is None or (kind is KeyboardInterrupt and (self.dir / "checkpoints" / "latest.pt").exists()):

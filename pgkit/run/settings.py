@@ -61,8 +61,9 @@ _BOUNDS: dict[str, tuple[float, float]] = {
     **dict.fromkeys(("old_rollouts", "delay", "backtracks", "damping", "max_kl", "kl_target"), (0, math.inf)),
     **dict.fromkeys(("beta", "priority_alpha", "priority_beta", "critic_coeff", "target_kl"), (0, math.inf)),
     **dict.fromkeys(("exploration_noise", "policy_noise", "noise_clip", "noise", "rho_thresh"), (0, math.inf)),
+    **dict.fromkeys(("c_thresh", "epsilon_frames"), (0, math.inf)),
     "seed": (0, 2**62),
-    **dict.fromkeys(("eval_every", "random_frames", "updates_per_step", "max_grad_norm"), (0, math.inf)),
+    **dict.fromkeys(("eval_every", "random_frames", "updates_per_step"), (0, math.inf)),
     **dict.fromkeys(("learning_rate", "q_learning_rate", "alpha_learning_rate", "clip_epsilon"), (0, math.inf)),
     **dict.fromkeys(("gamma", "lmbda", "tau", "epsilon_end"), (0, 1)),
     "alpha": (0, math.inf),
@@ -70,6 +71,7 @@ _BOUNDS: dict[str, tuple[float, float]] = {
     "dropout": (0, 0.99),
     "alpha_init": (1e-8, math.inf),
 }
+_ABOVE_ZERO = ("max_grad_norm", "relaxation")
 
 # what a resumed run may change: how long, how fast and how closely watched it goes on
 _FREE_ON_RESUME = {
@@ -177,11 +179,13 @@ def _variant(variants: Presets, name: str | None) -> tuple[str | None, Mapping[s
 
 def check(args: RunArgs) -> None:
     """A UserError for a number that no run can have."""
-    for name, (least, most) in _BOUNDS.items():
-        value = getattr(args, name, None)
+    for name, value in vars(args).items():
+        least, most = _BOUNDS.get(name, (-math.inf, math.inf))
         for number in value if isinstance(value, tuple) else (value,):
             if isinstance(number, float) and not math.isfinite(number):
                 raise UserError(f"--{name.replace('_', '-')} {number}: give a finite number")
+            if name in _ABOVE_ZERO and isinstance(number, int | float) and number <= 0:
+                raise UserError(f"--{name.replace('_', '-')} {number}: give a number above 0")
             if isinstance(number, int | float) and not least <= number <= most:
                 bound = f"at least {least:g}" if number < least else f"at most {most:g}"
                 raise UserError(f"--{name.replace('_', '-')} {number}: give {bound}")

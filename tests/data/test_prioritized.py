@@ -1,9 +1,11 @@
 """Prioritized draws: the tree, the probabilities, the weights, the write-back."""
 
+import pytest
 import torch
 
 from pgkit import data, envs
 from pgkit.data.sum_tree import SumTree
+from pgkit.errors import UserError
 from tests.data.test_replay import hand_made
 
 
@@ -53,3 +55,10 @@ def test_new_frames_get_the_largest_priority_and_evicted_ones_are_never_drawn():
         assert set(drawn.tolist()) == set(range(len(buffer)))
     newest = (buffer.start + len(buffer) - 1) % buffer.rows
     assert sampler.tree.values[newest] == 5.0
+
+
+def test_priorities_that_are_not_finite_are_named():
+    tree = SumTree(100)
+    tree.set(torch.tensor([3]), float("nan"))
+    with pytest.raises(UserError, match="priorities sum to nan: training diverged"):
+        tree.find(torch.tensor([0.5]))

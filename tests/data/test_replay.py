@@ -269,3 +269,17 @@ def test_further_entries_are_kept_and_come_back(tmp_path):
         data.ReplayBuffer(env, 20, entries={"reward": torch.zeros(1)})
     with pytest.raises(UserError, match="has no 'cost'"):
         buffer.extend(rollout.exclude("cost"))
+
+
+def test_until_a_checkpoint_is_written_the_one_before_has_its_file(tmp_path):
+    env = envs.make("Pendulum-v1", seed=1)
+    buffer, states = data.ReplayBuffer(env, 50), []
+    beside = data.BesideCheckpoint(buffer, tmp_path / "buffer.pt", save=True)
+    for rollout in rollouts(env, 5, 3):
+        buffer.extend(rollout)
+        states.append(beside.state_dict())
+    assert {path.name for path in tmp_path.iterdir()} == {"buffer.pt", "buffer-2.pt"}
+    for state, written in zip(states[1:], (10, 15), strict=True):
+        other = data.ReplayBuffer(env, 50)
+        data.BesideCheckpoint(other, tmp_path / "buffer.pt", save=True).load_state_dict(state)
+        assert other.written == written

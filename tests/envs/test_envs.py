@@ -262,6 +262,13 @@ def test_actions_of_an_integer_box_are_rounded():
     assert action.tolist() == [2, 5]
 
 
+def test_an_action_that_is_nan_is_not_the_environment_s_fault():
+    arrays = envs.make("Pendulum-v1", seed=1).arrays
+    arrays.reset()
+    with pytest.raises(UserError, match="the policy's action is"):
+        arrays.step(np.array([[np.nan]], np.float32))
+
+
 def test_a_seed_that_is_none_is_refused():
     with pytest.raises(UserError, match="seed=None: give a whole number"):
         envs.make("Pendulum-v1", seed=None)  # pyright: ignore[reportArgumentType]

@@ -62,3 +62,9 @@ def test_finished_episodes_are_those_where_done_oldest_first():
 def test_averages_are_over_the_rows_that_have_the_name():
     assert averages([{"a": 1.0, "b": 4.0}, {"a": 2.0}]) == {"a": 1.5, "b": 4.0}
     assert averages([]) == {}
+
+
+def test_a_line_that_was_cut_short_is_left_out(tmp_path: Path):
+    path = tmp_path / "metrics.csv"
+    path.write_text("frames,a,b\n10,1,2\n20,3,4\n3")
+    assert [row["frames"] for row in read_csv(path)[1]] == ["10", "20"]

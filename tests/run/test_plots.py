@@ -46,9 +46,20 @@ def test_a_run_with_nothing_in_it_yet_still_plots(tmp_path: Path):
     assert (tmp_path / "out.png").exists()
 
 
+def test_runs_without_frames_in_common_are_drawn_apart(tmp_path: Path):
+    runs = [
+        saved_run(tmp_path / name, "X-v0", f"frames,rollout/ep_rew_mean\n{text}\n")
+        for name, text in (("a", "10,1.0\n20,2.0"), ("b", "30,1.0\n40,2.0"))
+    ]
+    run.plot(runs, tmp_path / "out.svg")
+    assert "<!-- ppo training (2 runs) -->" in (tmp_path / "out.svg").read_text()
+
+
 def test_plot_errors(tmp_path: Path):
     with pytest.raises(UserError, match="not a run directory"):
         run.plot([tmp_path], tmp_path / "out.png")
     member = saved_run(tmp_path / "a", "X-v0", "frames\n")
     with pytest.raises(UserError, match="cannot write"):
         run.plot([member], tmp_path / "out.unknown")
+    with pytest.raises(UserError, match="it is a directory"):
+        run.plot([member], tmp_path)

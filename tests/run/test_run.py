@@ -13,7 +13,7 @@ import torch
 
 from pgkit import envs, run
 from pgkit.errors import UserError
-from pgkit.run import RunArgs
+from pgkit.run import RunArgs, checkpoint, directory
 from pgkit.run.metrics import averages
 
 Row = dict[str, str]
@@ -114,18 +114,21 @@ def test_rows_logged_after_the_checkpoint_are_dropped_on_resume(kit: SimpleNames
     assert rows(tmp_path / "r") == rows(tmp_path / "whole")
 
 
-def test_ctrl_c_finishes_the_step_saves_and_can_be_resumed(kit: SimpleNamespace, tmp_path: Path, capsys: Any):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_ctrl_c_finishes_the_step_saves_and_can_be_resumed(
+    kit: SimpleNamespace, tmp_path: Path, capsys: Any, number: signal.Signals
+):
     def interrupt(frames: int) -> None:
         if frames == 20:
-            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), number)
 
-    handler = signal.getsignal(signal.SIGINT)
+    handler = signal.getsignal(number)
     kit.train(arguments(tmp_path / "whole"))
     with pytest.raises(KeyboardInterrupt):
         kit.train(arguments(tmp_path / "r"), hook=interrupt)
     assert len(rows(tmp_path / "r")) == 3 and not (tmp_path / "r/summary.json").exists()
     assert f"--resume {tmp_path / 'r'} --total-frames 40" in capsys.readouterr().out
-    assert signal.getsignal(signal.SIGINT) is handler
+    assert signal.getsignal(number) is handler
     kit.train(arguments(tmp_path / "r", resume=tmp_path / "r"))
     assert rows(tmp_path / "r") == rows(tmp_path / "whole")
 
@@ -258,3 +261,42 @@ def test_a_run_resumed_from_python_keeps_its_settings(kit: SimpleNamespace, tmp_
     kit.train(args)
     assert args.seed == 5 and "keeps its own settings: seed=5" in caplog.text
     assert json.loads((tmp_path / "r" / "config.json").read_text())["settings"]["seed"] == 5
+
+
+def test_a_kill_between_two_files_loses_no_best_policy(kit: SimpleNamespace, tmp_path: Path, monkeypatch: Any):
+    def killed(path: Path, content: Any) -> None:
+        if saved and path.name != "policy.pt":
+            raise KeyboardInterrupt
+        saved.extend([path.name] if path.name != "policy.pt" else [])
+        save(path, content)
+
+    save, saved = checkpoint.save, []
+    kit.train(arguments(tmp_path / "whole"))
+    with monkeypatch.context() as patch:
+        patch.setattr("pgkit.run.checkpoint.save", killed)
+        with pytest.raises(KeyboardInterrupt):
+            kit.train(arguments(tmp_path / "r"))
+    assert saved == ["best.pt"]  # of the two, latest comes last: it says that there is a best
+
+
+def test_two_processes_do_not_go_on_with_one_run(kit: SimpleNamespace, tmp_path: Path):
+    kit.train(arguments(tmp_path / "r"))
+    held = directory.lock(tmp_path / "r")
+    with pytest.raises(UserError, match="another process goes on with this run"):
+        kit.train(arguments(tmp_path / "r", resume=tmp_path / "r", total=80))
+    directory.unlock(held)
+    kit.train(arguments(tmp_path / "r", resume=tmp_path / "r", total=80))
+    assert len(rows(tmp_path / "r")) == 8
+
+
+def test_a_run_that_ends_before_its_first_row_leaves_no_directory(kit: SimpleNamespace, tmp_path: Path):
+    for name, kept in (("bare", False), ("notes", True)):
+        path = tmp_path / name
+        if kept:
+            path.mkdir()
+            (path / "mine.txt").write_text("")
+        with pytest.raises(ZeroDivisionError), run.Run(arguments(path), "toy") as log:
+            log.track(policy=kit.policy(), eval_env=kit.Env)
+            _ = 1 / 0
+        assert path.exists() == kept
+        assert not (path / "config.json").exists()

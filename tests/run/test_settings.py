@@ -166,6 +166,8 @@ def test_whole_numbers_may_have_an_exponent():
         ({"gamma": 1.5}, "--gamma 1.5: give at most 1"),
         ({"gamma": float("nan")}, "--gamma nan: give a finite number"),
         ({"learning_rate": float("inf")}, "--learning-rate inf: give a finite number"),
+        ({"log_std": float("nan")}, "--log-std nan: give a finite number"),
+        ({"max_grad_norm": 0.0}, "--max-grad-norm 0.0: give a number above 0"),
     ],
 )
 def test_numbers_that_no_run_can_have(setting: dict, message: str):
@@ -173,6 +175,8 @@ def test_numbers_that_no_run_can_have(setting: dict, message: str):
     class Discounted(Args):
         gamma: float | None = None
         old_rollouts: int = 3
+        log_std: float = -0.5  # a setting that pgkit has no bounds for
+        max_grad_norm: float | None = None
 
     check(Discounted())
     with pytest.raises(UserError, match=message):
