@@ -11,6 +11,7 @@ from torchrl.data import Unbounded
 from torchrl.envs import Compose, EnvBase, InitTracker, RewardSum, StepCounter, TensorDictPrimer, TransformedEnv
 
 from pgkit.collectors.policy import memory
+from pgkit.errors import UserError
 
 
 class TorchRLCollector:
@@ -21,7 +22,7 @@ class TorchRLCollector:
     actor of pgkit's, also ``InitTracker`` and a primer of its ``recurrent_state``.
 
     Args:
-        env: any TorchRL environment, pgkit's included.
+        env: any TorchRL environment, pgkit's included; for a recurrent actor, a batch of environments.
         actor: TensorDict module that writes ``action``.
         frames_per_batch: frames of a rollout over all environments.
         total_frames: frames of the whole training; -1: endless.
@@ -39,8 +40,11 @@ class TorchRLCollector:
     ) -> None:
         from torchrl.collectors import Collector  # slow to import, and rarely needed
 
+        _check_types(env, actor)
         transforms = [RewardSum(), StepCounter()]
         if state := memory(actor, env.batch_size.numel()):
+            if not env.batch_size:
+                raise UserError("a recurrent actor reads a batch of environments, this is one: SerialEnv(1, make_env)")
             size = state["recurrent_state"].shape[-1]
             transforms += [InitTracker(), TensorDictPrimer(recurrent_state=Unbounded((size,)), expand_specs=True)]
         env = TransformedEnv(env, Compose(*transforms))
@@ -66,3 +70,16 @@ class TorchRLCollector:
     def shutdown(self) -> None:
         """Ends TorchRL's collector."""
         self.collector.shutdown()
+
+
+def _check_types(env: EnvBase, actor: TensorDictModuleBase) -> None:
+    """A ``UserError`` where the observation is of another floating type than the actor's weights."""
+    types = {p.dtype for p in actor.parameters() if p.dtype.is_floating_point}
+    for key in actor.in_keys:
+        dtype = env.observation_spec[key].dtype if key in env.observation_spec.keys(True, True) else None
+        if dtype is not None and dtype.is_floating_point and types and dtype not in types:
+            found, wanted = (str(x).removeprefix("torch.") for x in (dtype, min(types, key=str)))
+            raise UserError(
+                f"'{key}' is {found}, the actor's weights are {wanted}: convert it (TransformedEnv(env, "
+                "DoubleToFloat())), or the actor with .to(dtype)"
+            )

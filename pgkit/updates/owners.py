@@ -66,14 +66,15 @@ def check_parameters(chain: Chain, optimizer: Optimizer, total: Tensor) -> None:
     if frozen:
         raise UserError(
             f"the optimizer holds parameter {called(frozen[0])}{_more(frozen)}, which is frozen (requires_grad is "
-            "False): leave it out of the optimizer, or requires_grad_(True)"
+            "False): leave it out of the optimizer ([p for p in loss.parameters() if p.requires_grad]), or "
+            "requires_grad_(True)"
         )
     grads = torch.autograd.grad(total, trained, allow_unused=True)
     unused = [p for p, grad in zip(trained, grads, strict=True) if grad is None]
     if unused:
         raise UserError(
             f"the optimizer holds parameter {called(unused[0])}{_more(unused)} that no loss_* entry of {chain.name} "
-            "depends on: was the optimizer built for another agent?"
+            "depends on: is the coefficient of its term 0, or was the optimizer built for another agent?"
         )
 
 

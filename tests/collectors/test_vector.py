@@ -4,7 +4,7 @@ import pytest
 import torch
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import nn
-from torchrl.envs import RewardScaling, TransformedEnv
+from torchrl.envs import GymEnv, RewardScaling, TransformedEnv
 from torchrl.modules import OrnsteinUhlenbeckProcessModule
 
 from pgkit import collectors, envs, modules
@@ -189,6 +189,17 @@ def test_torchrl_collector_gives_the_same_seam():
     done = rollouts[0]["next", "done"]
     lengths = rollouts[0]["next", "step_count"][done]
     assert torch.equal(rollouts[0]["next", "episode_reward"][done], lengths.float())
+
+
+def test_torchrl_environments_that_do_not_fit_are_named():
+    env = GymEnv("InvertedPendulum-v5")  # its observations are float64
+    actor = modules.gaussian_actor(env)
+    with pytest.raises(UserError, match="'observation' is float64, the actor's weights are float32: convert it"):
+        collectors.TorchRLCollector(env, actor, frames_per_batch=8)
+    env = GymEnv("Pendulum-v1")
+    actor = modules.gaussian_actor(env, encoder=modules.gru(env, 4))
+    with pytest.raises(UserError, match="SerialEnv"):
+        collectors.TorchRLCollector(env, actor, frames_per_batch=8)
 
 
 def test_torchrl_collector_ends_at_total_frames_after_a_resume():
