@@ -94,7 +94,9 @@ def _slots(name: str, owner: Any, seen: set[int]) -> Iterator[tuple[str, _Holder
     keys: Any
     library = type(owner).__module__.split(".")[0]
     if isinstance(owner, MethodType | partial):
-        yield from _slots(name, owner.__self__ if isinstance(owner, MethodType) else owner.func, seen)
+        parts = [owner.__self__] if isinstance(owner, MethodType) else [owner.func, owner.args, owner.keywords]
+        for part in parts:
+            yield from _slots(name, part, seen)
         return
     if isinstance(owner, FunctionType):
         holder = _Closure(owner)

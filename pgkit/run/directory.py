@@ -88,7 +88,7 @@ def unlock(handle: int | None) -> None:
 
 def remove_if_bare(path: Path) -> None:
     """Removes what a run wrote that ended before its first row, and the directory if nothing else is in it."""
-    if (path / "metrics.csv").exists() or (path / "checkpoints").exists():
+    if not path.is_dir() or (path / "metrics.csv").exists() or (path / "checkpoints").exists():
         return
     for file in [path / "config.json", *path.glob("events.out.tfevents.*")]:
         file.unlink(missing_ok=True)

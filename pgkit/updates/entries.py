@@ -167,8 +167,10 @@ def _missing(chain: Chain, batch: TensorDictBase, key: Any, reader: str) -> str:
         else:
             written = ", ".join(show(k) for k in getattr(chain.advantage, "out_keys", ())) or "unknown entries"
             advice = f"{type(chain.advantage).__name__} writes {written}: use one name, or loss.set_keys(...)"
-    elif isinstance(key, str) and chain.source == "ReplayBuffer":
-        advice = f"the replay keeps it where told to: ReplayBuffer(env, entries={{'{key}': example of one frame}})"
+    elif isinstance(key, str) and chain.source != "the rollout" and reader == chain.name:
+        advice = (
+            f"the frames stored must have it, and pgkit's replay be told to keep it: entries={{'{key}': an example}}"
+        )
     elif key in _log_prob(chain):
         advice = "the actor should write it: build it with return_log_prob=True"
     elif key in getattr(chain.loss, "distribution_keys", ()):

@@ -206,7 +206,7 @@ class OffPolicyUpdate:
 
         def trial() -> dict[str, list[Tensor]]:
             out, reached = self.loss(batch.copy()), {}
-            for key in filter(is_loss, out.keys()):
+            for key in [key for key in out.keys() if is_loss(key) and out[key].requires_grad]:
                 grads = torch.autograd.grad(out[key].sum(), params, allow_unused=True, retain_graph=True)
                 reached[key] = [p for p, grad in zip(params, grads, strict=True) if grad is not None]
             named = [key for key in ("loss_qvalue", "loss_value", "loss_critic") if key in reached]

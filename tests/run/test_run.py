@@ -271,7 +271,6 @@ def test_a_kill_between_two_files_loses_no_best_policy(kit: SimpleNamespace, tmp
         save(path, content)
 
     save, saved = checkpoint.save, []
-    kit.train(arguments(tmp_path / "whole"))
     with monkeypatch.context() as patch:
         patch.setattr("pgkit.run.checkpoint.save", killed)
         with pytest.raises(KeyboardInterrupt):

@@ -55,7 +55,7 @@ def test_every_place_of_a_number_is_seen(monkeypatch):
     constants = Constants(loss)
     loss.surrogate = surrogate
     assert "'surrogate' went from functools.partial" in str(constants.changed())
-    for held in (kept, kept.__call__):
+    for held in (kept, kept.__call__, partial(surrogate, kept)):
         constants = Constants(loss_with(held))
         kept.power += 1
         assert "power' went from" in str(constants.changed())

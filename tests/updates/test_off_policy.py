@@ -428,17 +428,18 @@ class Conservative(losses.SACLoss):
     def forward(self, tensordict):
         out = super().forward(tensordict)
         out["loss_conservative"] = self.q(tensordict, tensordict["action"], self.qvalue_network_params).mean()
-        out["loss_prior"] = self.actor_network_params.flatten_keys().values().__iter__().__next__().square().mean()
+        out["loss_prior"] = next(self.actor_network_params.parameters()).square().mean()
         return out
 
 
 def test_a_term_that_trains_the_critics_alone_is_not_delayed_with_the_actor():
-    update, collector = agent(actor_delay=2)
-    update.loss = Conservative(collector.actor, update.loss.qvalue_network, gamma=0.9)
-    update.optimizer = torch.optim.Adam(update.loss.parameters(), lr=1e-2)
-    update._average = averaging(update.loss, 0.005)
-    for _ in range(2):
-        update.buffer.extend(collector.rollout())
+    env = envs.make("Pendulum-v1")
+    actor, temperature = modules.tanh_normal_actor(env, (16,)), controllers.FixedTemperature(0.2)  # trains nothing
+    loss = Conservative(actor, modules.q_value(env, hidden=(16,)), temperature=temperature)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=1e-2)
+    settings = {"batch_size": 32, "learning_starts": 64, "actor_delay": 2, "compile": "off"}
+    update = updates.OffPolicyUpdate(loss, data.ReplayBuffer(env, 500), optimizer, **settings)
+    update.buffer.extend(collectors.VectorCollector(env, actor, frames_per_batch=64).rollout())
     update.train(1)
     between = update.train(1)
     assert {name for name in between if name.startswith("loss_")} == {"loss_qvalue", "loss_conservative"}
