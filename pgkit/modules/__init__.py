@@ -2,6 +2,7 @@
 
 from pgkit.modules.actors import actor, gaussian_actor, tanh_normal_actor
 from pgkit.modules.bodies import Encoder, batch_renorm_mlp, ensemble_mlp, simba
+from pgkit.modules.causal_lm import causal_lm, token_value
 from pgkit.modules.deterministic import deterministic_actor
 from pgkit.modules.discrete import categorical_actor
 from pgkit.modules.encoders import dict_encoder
@@ -11,6 +12,7 @@ from pgkit.modules.mlp import mlp
 from pgkit.modules.normalizers import ObsNormalizer, ReturnScale
 from pgkit.modules.q_values import QValue, discrete_q_value, q_value
 from pgkit.modules.recurrent import gru, lstm
+from pgkit.modules.tokens import TokenActor, TokenDistribution, TokenValue
 from pgkit.modules.values import state_value
 
 __all__ = [
@@ -24,9 +26,13 @@ __all__ = [
     "OrnsteinUhlenbeck",
     "QValue",
     "ReturnScale",
+    "TokenActor",
+    "TokenDistribution",
+    "TokenValue",
     "actor",
     "batch_renorm_mlp",
     "categorical_actor",
+    "causal_lm",
     "deterministic_actor",
     "dict_encoder",
     "discrete_q_value",
@@ -39,4 +45,5 @@ __all__ = [
     "simba",
     "state_value",
     "tanh_normal_actor",
+    "token_value",
 ]
