@@ -43,7 +43,7 @@ def prompts(
         reward: ``(prompt, completion) -> float``, or several by name, which add up; by default the task's own.
         tokenizer: by default a character a token.
         prompt_length, completion_length: tokens, the latter with the stop token; by default the task's own.
-        held_out: the tenth of a drawn task's prompts that training never sees; a list is used as it is.
+        held_out: draw from the tenth of a task's prompts that training never sees; a list is used as it is.
         seed: of the prompts drawn.
         device: of the tokens.
 
@@ -51,44 +51,59 @@ def prompts(
         UserError: there is no such task, or nothing says what a completion is worth or how long it may be.
     """
     made = _task(task)
-    rewards = reward if reward is not None else getattr(made, "rewards", None)
+    rewards = made.rewards if reward is None else {"reward": reward} if callable(reward) else dict(reward)
     lengths = {
-        "prompt_length": prompt_length or getattr(made, "prompt_length", None),
-        "completion_length": completion_length or getattr(made, "completion_length", None),
+        "prompt_length": prompt_length or made.prompt_length,
+        "completion_length": completion_length or made.completion_length,
     }
-    if rewards is None:
-        raise UserError("nothing says what a completion is worth: give reward=, a function (prompt, completion) -> float")
-    if missing := [name for name, length in lengths.items() if length is None]:
+    if not rewards:
+        raise UserError(
+            "nothing says what a completion is worth: give reward=, a function (prompt, completion) -> float"
+        )
+    if missing := [name for name, length in lengths.items() if not length]:
         raise UserError(f"prompts of your own need {missing[0]}=, in tokens")
     whole(1, batch=batch, **lengths)
     return Prompts(
         made,
         batch,
-        rewards={"reward": rewards} if callable(rewards) else dict(rewards),
-        tokenizer=tokenizer or Characters(getattr(made, "alphabet", string.printable[:95])),
-        held_out=held_out,
+        rewards=rewards,
+        tokenizer=tokenizer or Characters(made.alphabet),
+        held_out=None if isinstance(task, Sequence) and not isinstance(task, str) else held_out,
         seed=seed,
         device=device,
         **lengths,
     )
 
 
-def _task(task: Any) -> Any:
-    if not isinstance(task, str):
-        if isinstance(task, Sequence) and not task:
+class Own:
+    """Prompts of a user: a list, or a function that draws one; rewards and lengths are still to be given."""
+
+    alphabet = string.printable[:95]
+    prompt_length = completion_length = 0
+    rewards: Mapping[str, Reward] = {}
+
+    def __init__(self, draw: Callable[[Random], str]) -> None:
+        self.prompt = draw
+
+
+def _task(task: str | Task | Sequence[str] | Callable[[Random], str]) -> Task:
+    if isinstance(task, str):
+        if task.startswith("reasoning_gym/"):
+            return GymTask(task.removeprefix("reasoning_gym/"))
+        if task not in TASKS:
+            raise UserError(f"no task '{task}': there are {', '.join(TASKS)}, reasoning_gym/NAME, a list, a function")
+        return TASKS[task]()
+    if isinstance(task, Sequence):
+        if not task:
             raise UserError("the list of prompts is empty")
-        return task
-    if task.startswith("reasoning_gym/"):
-        return GymTask(task.removeprefix("reasoning_gym/"))
-    if task not in TASKS:
-        raise UserError(f"no task '{task}': there are {', '.join(TASKS)}, reasoning_gym/NAME, a list, a function")
-    return TASKS[task]()
+        return Own(lambda random: random.choice(task))
+    return Own(task) if callable(task) else task
 
 
 class Prompts:
     """A :class:`~pgkit.seams.Simulator` of one-step episodes; the arguments are those of :func:`prompts`.
 
-    ``observation [N, P]`` holds a prompt's tokens, -1 at the padding on its left; the action ``[N, C]`` is a completion.
+    ``observation [N, P]`` is a prompt's tokens, -1 at the padding on its left; the action ``[N, C]`` is a completion.
 
     Attributes:
         texts: the prompts drawn last.
@@ -99,14 +114,14 @@ class Prompts:
 
     def __init__(
         self,
-        task: Any,
+        task: Task,
         batch: int,
         *,
-        rewards: dict[str, Reward],
+        rewards: Mapping[str, Reward],
         tokenizer: Tokenizer,
         prompt_length: int,
         completion_length: int,
-        held_out: bool,
+        held_out: bool | None,
         seed: int,
         device: torch.device | str,
     ) -> None:
@@ -141,7 +156,9 @@ class Prompts:
         self.episode_reward, self.step_count = {"reward": reward}, torch.ones_like(self.step_count)
         ended = torch.ones_like(reward, dtype=torch.bool)
         before, fresh = self.encode(self.texts), self.reset()
-        return Step({"observation": before}, {"reward": reward}, {"terminated": ended}, {"truncated": ~ended}, {}, fresh)
+        return Step(
+            {"observation": before}, {"reward": reward}, {"terminated": ended}, {"truncated": ~ended}, {}, fresh
+        )
 
     def encode(self, texts: Sequence[str]) -> Tensor:
         """Prompts as tokens ``[N, P]``, -1 at the padding on the left.
@@ -187,14 +204,11 @@ class Prompts:
         }  # fmt: skip
 
     def _draw(self) -> str:
-        if isinstance(self.task, Sequence):
-            return self._random.choice(self.task)
-        draw = self.task if callable(self.task) else self.task.prompt
         for _ in range(10_000):
-            text = draw(self._random)
-            if (zlib.crc32(text.encode()) % 10 == 0) == self.held_out:
+            text = self.task.prompt(self._random)
+            if self.held_out is None or (zlib.crc32(text.encode()) % 10 == 0) == self.held_out:
                 return text
-        raise UserError("the task draws no prompt that is held out: give held-out prompts as a list")
+        raise UserError("the task draws too few prompts to hold a tenth of them out: give prompts as lists")
 
     def state_dict(self) -> dict[str, Any]:
         return {"random": self._random.getstate(), "texts": list(self.texts)}

@@ -12,7 +12,7 @@ from pgkit.modules.mlp import mlp
 from pgkit.modules.normalizers import ObsNormalizer, ReturnScale
 from pgkit.modules.q_values import QValue, discrete_q_value, q_value
 from pgkit.modules.recurrent import gru, lstm
-from pgkit.modules.tokens import TokenActor, TokenDistribution, TokenValue
+from pgkit.modules.tokens import TokenActor, TokenDistribution, TokenPolicy, TokenValue
 from pgkit.modules.values import state_value
 
 __all__ = [
@@ -28,6 +28,7 @@ __all__ = [
     "ReturnScale",
     "TokenActor",
     "TokenDistribution",
+    "TokenPolicy",
     "TokenValue",
     "actor",
     "batch_renorm_mlp",

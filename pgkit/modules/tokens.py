@@ -97,8 +97,7 @@ class TokenActor(TensorDictModuleBase):
     @torch.no_grad()
     def sample(
         self,
-        prompt: Tensor,
-        mask: Tensor,
+        observation: Tensor,
         length: int,
         copies: int = 1,
         *,
@@ -106,18 +105,20 @@ class TokenActor(TensorDictModuleBase):
         greedy: bool = False,
         temperature: float | None = None,
     ) -> Completions:
-        """``copies`` completions of each prompt ``[N, P]``, of at most ``length`` tokens: rows ``[N * copies, P + length]``.
+        """``copies`` completions of each prompt, of at most ``length`` tokens: rows ``[N * copies, P + length]``.
 
         Every prompt is read once, with a key-value cache. The log-probabilities are those of the whole policy at its
         temperature, whatever ``top_p`` leaves out, so that the loss's first ratio is 1.
 
         Args:
-            mask: ``[N, P]``, False at the padding on the left.
+            observation: the prompts' tokens ``[N, P]``, -1 at the padding on their left.
             top_p: draw from the fewest tokens whose probabilities add up to this (Holtzman et al., 2019).
             greedy: the likeliest tokens.
             temperature: in place of the policy's own.
         """
         heat = self.temperature if temperature is None else temperature
+        mask = observation >= 0
+        prompt = torch.where(mask, observation, self.pad)
         start, total = prompt.shape[1], prompt.shape[1] + length
         cache: Any = self.network.cache(len(prompt), total)
         logits = self.network(prompt, mask, cache)[:, -1].repeat_interleave(copies, 0)
@@ -140,6 +141,24 @@ class TokenActor(TensorDictModuleBase):
         completion = attention.clone()
         completion[:, :start] = False
         return Completions(tokens, attention, completion, log_prob)
+
+
+class TokenPolicy(TensorDictModuleBase):
+    """An actor that plays a prompt environment: ``observation [N, P]`` to a completion ``action [N, length]``.
+
+    It draws at temperature 1, also where an evaluation asks for the likeliest action: a share of solved prompts is that
+    of the policy. ``greedy``: the likeliest tokens.
+    """
+
+    def __init__(self, actor: TokenActor, length: int, *, greedy: bool = False) -> None:
+        super().__init__()
+        self.actor, self.length, self.greedy = actor, length, greedy
+        self.in_keys, self.out_keys = ["observation"], ["action"]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        observation = tensordict["observation"].long()
+        rows = self.actor.sample(observation, self.length, greedy=self.greedy, temperature=1.0)
+        return tensordict.set("action", rows.tokens[:, observation.shape[1] :])
 
 
 class TokenValue(TensorDictModuleBase):
