@@ -51,9 +51,7 @@ def test_k1_and_k3_are_unbiased_and_k2_has_the_gradient_of_the_divergence():
     for kind in ("k1", "k3"):
         torch.testing.assert_close((pi * kl_estimate(d, kind)).sum(), exact)
     (true,) = torch.autograd.grad(exact, logit, retain_graph=True)
-    slopes = {
-        k: torch.autograd.grad((pi * kl_estimate(d, k)).sum(), logit, retain_graph=True)[0] for k in ("k1", "k2")
-    }
+    slopes = {k: torch.autograd.grad((pi * kl_estimate(d, k)).sum(), logit, retain_graph=True)[0] for k in ("k1", "k2")}
     torch.testing.assert_close(slopes["k2"], true)
     assert slopes["k1"].abs() < 1e-12  # as a loss it ignores the reference
     with pytest.raises(ValueError, match="kl='k4': give 'k1', 'k2' or 'k3'"):
