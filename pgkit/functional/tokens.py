@@ -29,7 +29,9 @@ def sequence_log_ratio(log_ratio: Tensor, mask: Tensor) -> Tensor:
     return (kept / mask.sum(1, keepdim=True).clamp(min=1)).expand_as(log_ratio)
 
 
-def token_weights(mask: Tensor, aggregation: str = "token", length: int | None = None) -> Tensor:
+def token_weights(
+    mask: Tensor, aggregation: str = "token", length: int | None = None, dtype: torch.dtype = torch.float32
+) -> Tensor:
     r"""Weights :math:`w` of an aggregation: the loss of a batch is :math:`\sum_{i,t} w_{i,t}\, l_{i,t}`.
 
     With :math:`|y_i|` tokens in row :math:`i` and :math:`n` rows that have any:
@@ -41,6 +43,7 @@ def token_weights(mask: Tensor, aggregation: str = "token", length: int | None =
     Args:
         mask: bool ``[B, L]``; rows without a token (dropped groups) count nowhere.
         length: :math:`L` of ``constant``; the mask's by default.
+        dtype: of the weights.
 
     Returns:
         ``[B, L]``, 0 outside the mask.
@@ -49,14 +52,15 @@ def token_weights(mask: Tensor, aggregation: str = "token", length: int | None =
         ValueError: there is no such aggregation.
     """
     is_flag(mask=mask)
-    lengths = mask.sum(1, keepdim=True)
+    counted = mask.to(dtype)
+    lengths = counted.sum(1, keepdim=True)
     rows = (lengths > 0).sum().clamp(min=1)
     if aggregation == "token":
-        return mask / lengths.sum().clamp(min=1)
+        return counted / lengths.sum().clamp(min=1)
     if aggregation == "sequence":
-        return mask / (rows * lengths.clamp(min=1))
+        return counted / (rows * lengths.clamp(min=1))
     if aggregation == "constant":
-        return mask / (rows * (length or mask.shape[1]))
+        return counted / (rows * (length or mask.shape[1]))
     raise ValueError(f"aggregation={aggregation!r}: give 'token', 'sequence' or 'constant'")
 
 

@@ -161,7 +161,7 @@ class GRPOLoss(Loss):
             objective = self.surrogate(log_ratio, advantage)
         same_shape(advantage=advantage, surrogate=objective)
 
-        weights = token_weights(mask, self.aggregation, self.max_length)
+        weights = token_weights(mask, self.aggregation, self.max_length, log_prob.dtype)
         out = TensorDict({"loss_objective": -total(weights, objective.squeeze(-1), mask)})
         self._add_terms(out, batch, weights, mask, log_prob, dist)
         self._add_metrics(out, mask, token_log_ratio.detach(), log_ratio.detach().squeeze(-1))
@@ -171,9 +171,9 @@ class GRPOLoss(Loss):
         self, out: TensorDict, batch: TensorDictBase, weights: Tensor, mask: Tensor, log_prob: Tensor, dist: Any
     ) -> None:
         """The terms besides the objective, each with its metric."""
-        keys, each = self.tensor_keys, token_weights(mask)
+        keys, each = self.tensor_keys, token_weights(mask, dtype=log_prob.dtype)
         if self.has_reference:
-            divergence = kl_estimate(batch[keys.ref_log_probs] - log_prob, self.kl)
+            divergence = kl_estimate(torch.where(mask, batch[keys.ref_log_probs] - log_prob, 0.0), self.kl)
             out["loss_kl_to_ref"] = self.kl_to_ref_coeff * total(weights, divergence, mask)
             out["kl_to_ref"] = total(each, divergence.detach(), mask)
         if self.entropy_bonus:
@@ -190,7 +190,7 @@ class GRPOLoss(Loss):
 
     def _add_metrics(self, out: TensorDict, mask: Tensor, token_log_ratio: Tensor, log_ratio: Tensor) -> None:
         """How far the policy is from the one that sampled; ``ESS`` as a share of the tokens."""
-        each, ratio = token_weights(mask), log_ratio.exp()
+        each, ratio = token_weights(mask, dtype=log_ratio.dtype), log_ratio.exp()
         clipped = (ratio < 1 - self.clip_epsilon_low) | (ratio > 1 + self.clip_epsilon_high)
         out["kl_approx"] = total(each, approx_kl(token_log_ratio), mask)
         out["clip_fraction"] = total(each, clipped.to(each.dtype), mask)
