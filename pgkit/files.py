@@ -71,7 +71,7 @@ def load(path: Path) -> Any:
     try:
         with path.open("rb") as file:
             if not _fits(file):
-                raise UserError(f"{path} is damaged, or an earlier pgkit wrote it: its hash does not fit")
+                raise UserError(f"{path} is damaged: its hash does not fit, or an earlier pgkit wrote it")
             file.seek(0)
             return _decode(torch.load(file, map_location="cpu", weights_only=True))
     except FileNotFoundError:

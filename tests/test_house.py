@@ -52,7 +52,7 @@ def loss_modules(path: Path):
 
 
 def outside(folder: str, path: Path):
-    """Imports of ``path`` that the table forbids; pgkit's errors, files, compiling, constants and a folder's own are free."""
+    """Imports of ``path`` that the table forbids; pgkit's top-level modules and a folder's own are free."""
     governed = THIRD_PARTY | set(MAY_IMPORT)
     free = {folder, "errors", "files", "compiling", "constants"}
     return {name for name in imports(path) if name in governed} - MAY_IMPORT[folder] - free

@@ -1,7 +1,8 @@
 """``pgkit ls / cp / run / eval / plot``. Heavy imports wait until a command needs them."""
 
 import argparse
-import shutil
+import runpy
+import sys
 from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
@@ -99,7 +100,7 @@ def copy_recipe(args: argparse.Namespace) -> None:
         raise UserError(f"no directory {target.parent} to copy into")
     try:
         with target.open("xb") as file:  # exclusive: a link that waits there is not followed
-            shutil.copyfileobj(source.open("rb"), file)
+            file.write(source.read_bytes())
     except FileExistsError:
         raise UserError(f"{target} exists and is not overwritten; give another name") from None
     except OSError as error:
@@ -109,7 +110,13 @@ def copy_recipe(args: argparse.Namespace) -> None:
 
 
 def run_recipe(args: argparse.Namespace) -> None:
-    recipe = recipes.load(recipes.find(args.recipe))
+    path = recipes.find(args.recipe)
+    if not recipes.is_shipped(path):  # as `python FILE` runs it; its folder comes last, so that it hides no module
+        sys.argv = [args.recipe, *args.flags]
+        sys.path.append(str(path.resolve().parent))
+        runpy.run_path(str(path), run_name="__main__")
+        return
+    recipe = recipes.load(path)
     variant = ["--variant", args.recipe] if args.recipe in recipes.variants() else []
     from pgkit import run
 

@@ -18,6 +18,11 @@ def recipes_dir() -> Path:
     return inside if inside.is_dir() else package.parent / "recipes"
 
 
+def is_shipped(file: Path) -> bool:
+    """Whether it is one of the shipped recipes."""
+    return file.resolve().parent == recipes_dir().resolve()
+
+
 def names() -> list[str]:
     """Names of the shipped recipes, each one file."""
     return sorted(path.stem for path in recipes_dir().glob("*.py") if not path.name.startswith("_"))

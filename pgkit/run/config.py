@@ -88,9 +88,7 @@ def read_json(path: Path) -> Any:
         raise UserError(f"{path} cannot be read: {error}") from error
     told = content.pop("sha256", None) if isinstance(content, dict) else None
     if told is not None and told != _hash(content):
-        raise UserError(
-            f"{path} is damaged, or was edited: its hash does not fit; remove the sha256 to take it as it is"
-        )
+        raise UserError(f"{path} is damaged, or was edited: its hash does not fit (an edited one has no sha256)")
     return content
 
 
@@ -101,7 +99,7 @@ def _hash(content: dict[str, Any]) -> str:
 def recipe_file(args_class: type[RunArgs]) -> str | None:
     """The file in which a recipe defines its settings; None for a shipped one, and outside files."""
     file = vars(sys.modules[args_class.__module__]).get("__file__")
-    if args_class is RunArgs or file is None or Path(file).resolve().parent == recipes.recipes_dir().resolve():
+    if args_class is RunArgs or file is None or recipes.is_shipped(Path(file)):
         return None
     return str(Path(file).resolve())
 

@@ -97,8 +97,9 @@ def _flags(args_class: type[A], base: A, argv: Sequence[str]) -> A:
     except SystemExit as end:
         if not end.code:
             raise
-    lines = (line.strip("│ ") for line in box.getvalue().splitlines()[1:])  # without the title
-    message = " ".join(itertools.takewhile(lambda line: line.strip("─"), lines))
+    lines = [line.strip("│| ") for line in box.getvalue().splitlines()[1:]]  # without the title
+    parts = [list(part) for is_text, part in itertools.groupby(lines, lambda x: bool(x.strip("─-╰╯+"))) if is_text]
+    message = " ".join(parts[0])
     raise UserError(f"{message} (see {program} --help)")
 
 

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import torch
 
-from pgkit import envs, run
-from pgkit.errors import UserError
-from pgkit.run import RunArgs, checkpoint, directory
+from pgkit import envs, files, run
+from pgkit.errors import Diverged, UserError
+from pgkit.run import RunArgs, directory
 from pgkit.run.metrics import averages
 
 Row = dict[str, str]
@@ -43,7 +43,7 @@ def test_a_run_leaves_what_the_design_promises(kit: SimpleNamespace, tmp_path: P
     assert summary["frames"] == 40 and summary["rollout/ep_rew_mean"] == 25.0 and summary["time/fps"] > 0
     assert str(summary["eval/mean_reward"]) == rows(path)[-1]["eval/mean_reward"]
     assert (path / "curve.png").read_bytes()[:4] == b"\x89PNG"
-    assert sorted(p.name for p in (path / "checkpoints").iterdir()) == ["best.pt", "latest.pt", "policy.pt"]
+    assert sorted(p.name for p in (path / "checkpoints").iterdir()) == ["best.pt", "latest.pt"]
     out = capsys.readouterr().out
     assert out.count("frames/s") == 2  # one line an evaluation on a pipe
     for command in (f"--resume {path} --total-frames 80", f"pgkit eval {path}", f"pgkit plot {path}"):
@@ -175,7 +175,7 @@ def test_a_directory_with_a_run_is_refused_and_stays_as_it_is(kit: SimpleNamespa
     [
         ({"recipe": "other"}, "holds a run of walk, not of other"),
         ({"total": 40}, "already trained 40 frames"),
-        ({"extra": {"second": torch.nn.Linear(1, 1)}}, "this recipe tracks counter, policy, second"),
+        ({"extra": {"second": torch.nn.Linear(1, 1)}}, "this recipe tracks agent, counter, second"),
     ],
 )
 def test_a_resume_that_cannot_work_writes_nothing(
@@ -207,12 +207,14 @@ def test_a_run_without_a_checkpoint_cannot_be_resumed(kit: SimpleNamespace, tmp_
 
 
 def test_a_run_that_diverges_says_so_once(kit: SimpleNamespace, tmp_path: Path, caplog: pytest.LogCaptureFixture):
-    from pgkit.run import Run
+    def diverge() -> None:
+        with run.Run(arguments(tmp_path / "r"), "walk") as log:
+            log.track(policy=kit.policy(), eval_env=kit.Env)
+            for frames in (10, 20, 30):
+                log.step(frames, None, {"loss_actor": 1.0 if frames < 20 else float("nan")})
 
-    with Run(arguments(tmp_path / "r"), "walk") as log:
-        log.track(policy=kit.policy(), eval_env=kit.Env)
-        for frames in (10, 20, 30):
-            log.step(frames, None, {"loss_actor": 1.0 if frames < 20 else float("nan")})
+    with pytest.raises(Diverged, match=r"train/loss_actor is not finite at the end \(30 frames\)"):
+        diverge()
     said = [record.getMessage() for record in caplog.records]
     assert len(said) == 1 and said[0].startswith("train/loss_actor is nan at 20 frames: the training has diverged")
 
@@ -265,14 +267,14 @@ def test_a_run_resumed_from_python_keeps_its_settings(kit: SimpleNamespace, tmp_
 
 def test_a_kill_between_two_files_loses_no_best_policy(kit: SimpleNamespace, tmp_path: Path, monkeypatch: Any):
     def killed(path: Path, content: Any) -> None:
-        if saved and path.name != "policy.pt":
+        if saved:
             raise KeyboardInterrupt
-        saved.extend([path.name] if path.name != "policy.pt" else [])
+        saved.append(path.name)
         save(path, content)
 
-    save, saved = checkpoint.save, []
+    save, saved = files.save, []
     with monkeypatch.context() as patch:
-        patch.setattr("pgkit.run.checkpoint.save", killed)
+        patch.setattr("pgkit.files.save", killed)
         with pytest.raises(KeyboardInterrupt):
             kit.train(arguments(tmp_path / "r"))
     assert saved == ["best.pt"]  # of the two, latest comes last: it says that there is a best
