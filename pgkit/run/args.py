@@ -135,13 +135,14 @@ def imported(name: str) -> Callable[[gym.Env], gym.Env]:
     if not (module and colon and function):
         raise UserError(f"--wrapper {name}: give module:function, as in my_module:wrap")
     try:
-        return getattr(importlib.import_module(module), function)
+        found = vars(importlib.import_module(module)).get(function)
     except ModuleNotFoundError as error:
         if error.name != module:
             raise
         raise UserError(f"--wrapper {name}: no module '{module}', neither here nor installed") from None
-    except AttributeError:
-        raise UserError(f"--wrapper {name}: the module has no '{function}'") from None
+    if not callable(found):
+        raise UserError(f"--wrapper {name}: {'it is no function' if found else 'the module has no ' + repr(function)}")
+    return found
 
 
 def wrapped(env_id: str, wrapper: Callable[[gym.Env], gym.Env], **kwargs: Any) -> gym.Env:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +31,15 @@ def load(path: Path) -> dict[str, Any]:
     if not isinstance(saved, dict) or any(not isinstance(saved.get(key), kind) for key, kind in _KINDS.items()):
         raise UserError(f"{path} is damaged: it is no checkpoint")
     return saved
+
+
+@contextlib.contextmanager
+def damage(run_dir: Path) -> Iterator[None]:
+    """A UserError in place of what a checkpoint of another structure raises."""
+    try:
+        yield
+    except (KeyError, TypeError, ValueError, RuntimeError, AttributeError, OverflowError) as error:
+        raise UserError(f"the checkpoint of {run_dir} is damaged: {str(error).splitlines()[0]}") from error
 
 
 def restore(tracked: dict[str, Stateful], states: dict[str, Any], where: Path) -> None:

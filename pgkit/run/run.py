@@ -111,14 +111,16 @@ class Run:
             raise UserError(
                 f"{self.dir} has already trained {saved['frames']} frames: give a --total-frames above that"
             )
-        counters, rows = saved["counters"], self.dir / "metrics.csv"
-        if rows.exists() and digest(rows, saved["frames"]) != counters.get("metrics"):
+        rows = self.dir / "metrics.csv"
+        if rows.exists() and digest(rows, saved["frames"]) != saved["counters"].get("metrics"):
             raise UserError(f"{rows} is damaged: its rows are not those that were saved; move it away to go on without")
         self._saved = saved
         self.frames = self._seen = self._saved_at = saved["frames"]
-        self.best, self._evaluated = counters["best"], counters["evaluated"]
-        self._episodes.extend(counters["episodes"])
-        self._clock = Clock(already=counters["wall_s"])
+        with checkpoint.damage(self.dir):
+            counters = saved["counters"]
+            self.best, self._evaluated = {**counters["best"]}, {**counters["evaluated"]}
+            self._episodes.extend((float(reward), int(length)) for reward, length in counters["episodes"])
+            self._clock = Clock(already=float(counters["wall_s"]))
 
     def track(
         self,
@@ -163,7 +165,8 @@ class Run:
         before, identity = None, secrets.token_hex(4)
         if self._saved:
             checkpoint.restore(tracked, self._saved["states"], self.dir / "checkpoints" / "latest.pt")
-            seeding.set_rng_state(self._saved["rng"])
+            with checkpoint.damage(self.dir):
+                seeding.set_rng_state(self._saved["rng"])
             before = config.read_config(self.dir)
             before["resumed_at"], identity = [*before["resumed_at"], self.frames], before["id"]
             self._saved["states"] = {}  # a copy of everything
