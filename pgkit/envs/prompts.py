@@ -10,9 +10,11 @@ from random import Random
 from typing import Any, Literal
 
 import torch
+from tensordict import TensorDict
 from torch import Tensor
 from torchrl.data import Bounded, Composite, Unbounded
 
+from pgkit.envs.prompt_arrays import PromptArrays
 from pgkit.envs.prompt_gym import GymTask
 from pgkit.envs.prompt_tasks import Addition, Countdown, Reward, Sorting, Task
 from pgkit.envs.tokenizers import Characters, Tokenizer
@@ -141,12 +143,18 @@ class Prompts:
         self.done_spec = Composite(done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=(batch,))
         self.episode_reward: Entries = {"reward": torch.zeros(batch, 1)}
         self.step_count = torch.zeros(batch, dtype=torch.int64)
+        self.arrays = PromptArrays(self)
+        self.observation_spec_unbatched, self.action_spec_unbatched = self.observation_spec[0], acted[0]
+
+    def set_seed(self, seed: int) -> None:
+        """Of the prompts drawn from now on."""
+        self._random.seed(seed)
 
     def reset(self, seed: int | None = None) -> Entries:
         """Draws ``N`` prompts."""
         if seed is not None:
             self._random.seed(seed)
-        self.texts = [self._draw() for _ in range(self.num_envs)]
+        self.texts = self.draw(self.num_envs)
         return {"observation": self.encode(self.texts)}
 
     def step(self, action: Entries) -> Step:
@@ -182,6 +190,18 @@ class Prompts:
         padded = [row + [self.pad] * (self.completion_length - len(row)) for row in rows]
         return torch.tensor(padded, dtype=torch.int64, device=self.device)
 
+    def rows(self, texts: Sequence[str], answers: Sequence[str]) -> TensorDict:
+        """Prompts with given answers as token rows ``[N]``, for supervised learning; longer answers are cut."""
+        prompt, completion = self.encode(texts), self.completions(answers)
+        seen, nothing = prompt >= 0, torch.zeros_like(prompt, dtype=torch.bool)
+        ended = (completion == self.stop).cumsum(1) - (completion == self.stop).int() > 0  # beyond the stop token
+        masks = {
+            "all_attention_mask": torch.cat([seen, ~ended], 1),
+            "all_assistant_mask": torch.cat([nothing, ~ended], 1),
+        }
+        tokens = torch.cat([torch.where(seen, prompt, self.pad), completion], 1)
+        return TensorDict({"tokens": {"full": tokens}, "masks": masks}, [len(tokens)])
+
     def decode(self, completions: Tensor) -> list[str]:
         """Completions ``[N, C]`` as texts, up to the stop token."""
         rows = completions.tolist()
@@ -202,6 +222,10 @@ class Prompts:
             )
             for name, reward in self.rewards.items()
         }  # fmt: skip
+
+    def draw(self, count: int) -> list[str]:
+        """So many prompts, as texts."""
+        return [self._draw() for _ in range(count)]
 
     def _draw(self) -> str:
         for _ in range(10_000):

@@ -8,6 +8,7 @@ from pgkit.modules.discrete import categorical_actor
 from pgkit.modules.encoders import dict_encoder
 from pgkit.modules.ensemble import EnsembleBatchRenorm, EnsembleDropout, EnsembleLayerNorm, EnsembleLinear
 from pgkit.modules.exploration import GaussianExploration, OrnsteinUhlenbeck
+from pgkit.modules.hugging_face import hugging_face, hugging_face_tokenizer
 from pgkit.modules.mlp import mlp
 from pgkit.modules.normalizers import ObsNormalizer, ReturnScale
 from pgkit.modules.q_values import QValue, discrete_q_value, q_value
@@ -40,6 +41,8 @@ __all__ = [
     "ensemble_mlp",
     "gaussian_actor",
     "gru",
+    "hugging_face",
+    "hugging_face_tokenizer",
     "lstm",
     "mlp",
     "q_value",
