@@ -180,6 +180,8 @@ def main(args: Args) -> None:
         )
         kept = {"reference": reference} if reference is not None else {}
         log.track(agent=built, eval_env=args.make_env, update=update, collector=collector, **kept)
+        if reference is not None and args.init:
+            reference.load_state_dict(policy.actor.state_dict())  # what --init gave the actor
         greedy, test = (
             modules.TokenPolicy(policy.actor, env.completion_length, greedy=True),
             args.make_env(1, args.seed),

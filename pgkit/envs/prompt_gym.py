@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import string
 from collections.abc import Mapping
 from random import Random
 from typing import Any
@@ -22,6 +23,7 @@ class GymTask:
         settings: the data set's own.
     """
 
+    alphabet = string.printable[:95] + "\n"
     prompt_length, completion_length = 96, 16
 
     def __init__(self, name: str, size: int = 10_000, **settings: Any) -> None:

@@ -74,7 +74,8 @@ def test_prompts_are_padded_on_the_left_and_completions_on_the_right():
 
 def test_held_out_prompts_are_never_drawn_for_training():
     train, held_out = envs.prompts("sorting", 3000, seed=1), envs.prompts("sorting", 3000, seed=2, held_out=True)
-    train.reset(), held_out.reset()
+    train.reset()
+    held_out.reset()
     assert not set(train.texts) & set(held_out.texts)
     with pytest.raises(UserError, match="too few prompts to hold a tenth of them out"):
         envs.prompts(lambda random: "1+1=", 1, reward=lambda p, c: 0, held_out=True, **OWN).reset()
@@ -151,3 +152,16 @@ def test_rewards_that_are_no_number(reward, message):
     env = envs.prompts(["ab"], 1, reward={"mine": lambda p, c: reward}, **OWN)
     with pytest.raises(UserError, match=message):
         env.verify(["ab"], env.completions(["ab"]))
+
+
+def test_a_task_of_reasoning_gym():
+    env = envs.prompts("reasoning_gym/chain_sum", 5, seed=1)
+    env.reset()
+    answers = [
+        str(eval(text.removeprefix("State the final answer to the following arithmetic problem: ").rstrip(" =")))
+        for text in env.texts
+    ]
+    scores = env.verify(env.texts, env.completions([answers[0], *(f"{answer}1" for answer in answers[1:])]))["reward"]
+    assert scores[0] == 1 and scores[1:].max() < 1
+    with pytest.raises(UserError, match="reasoning_gym/nothing: "):
+        envs.prompts("reasoning_gym/nothing")

@@ -11,11 +11,12 @@ from pgkit.errors import UserError
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """A llama of two layers, with a character tokenizer."""
-    from tokenizers import Regex, Tokenizer, models, pre_tokenizers
+    from tokenizers import Regex, Tokenizer, decoders, models, pre_tokenizers
 
     path = tmp_path_factory.mktemp("model")
     vocab = {c: i for i, c in enumerate(["<end>", "<unk>", *"0123456789+="])}
     tokenizer = Tokenizer(models.WordLevel(vocab, unk_token="<unk>"))
+    tokenizer.decoder = decoders.Fuse()
     tokenizer.pre_tokenizer = pre_tokenizers.Split(Regex("."), "isolated")
     transformers.PreTrainedTokenizerFast(tokenizer_object=tokenizer, eos_token="<end>").save_pretrained(path)
     torch.manual_seed(0)
