@@ -70,9 +70,10 @@ def setup(loss_class, **settings):
     actor = modules.causal_lm(env, width=32)
     optimizer = torch.optim.Adam(actor.parameters(), lr=1e-2)
     advantage = advantages.GroupRelative(8, drop=loss_class is losses.GRPOLoss)
-    update = updates.OnPolicyUpdate(
-        loss_class(actor, **settings), advantage, optimizer, epochs=1, minibatch_size=16, seed=0, compile="off"
-    )
+    loss = loss_class(actor, **settings)
+    if loss_class is TorchRLGRPOLoss:  # its result is a TensorClass, whose entries are no items
+        loss.register_forward_hook(lambda module, args, out: out.to_tensordict())
+    update = updates.OnPolicyUpdate(loss, advantage, optimizer, epochs=1, minibatch_size=16, seed=0, compile="off")
     return collectors.TokenCollector(env, actor, group_size=8, total_frames=64 * 12), update
 
 
