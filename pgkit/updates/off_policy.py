@@ -9,13 +9,12 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
+from pgkit.checks import LossView, assembly, check_settings, diagram, is_loss
 from pgkit.compiling import check_compile, worth_compiling
 from pgkit.data import ReplayBuffer
-from pgkit.errors import UserError, whole, within
-from pgkit.updates import optimizers, restoring, wiring
+from pgkit.errors import UserError
+from pgkit.updates import optimizers, restoring
 from pgkit.updates.batches import Batches, OwnBatches, TorchRLBatches
-from pgkit.updates.chain import Chain, is_loss
-from pgkit.updates.diagram import diagram
 from pgkit.updates.step import GradientStep
 from pgkit.updates.targets import averaging, copying
 
@@ -64,32 +63,6 @@ class OffPolicyUpdate:
     ) -> None:
         optimizers.check_optimizer(optimizer)
         check_compile(compile)
-        whole(1, batch_size=batch_size, actor_delay=actor_delay)
-        within(0, 1, tau=tau)
-        within(0, float("inf"), updates_per_step=updates_per_step)
-        if not hasattr(buffer, "sample"):
-            raise UserError(
-                f"the update draws from a replay buffer, this is a {type(buffer).__name__}: use data.ReplayBuffer"
-            )
-        if learning_starts < batch_size:
-            raise UserError(
-                f"batch_size={batch_size} is above the learning_starts={learning_starts} frames stored at the first "
-                "update: raise learning_starts or lower batch_size"
-            )
-        own = isinstance(buffer, ReplayBuffer)
-        unfinished = (buffer.n_steps - 1) * buffer.columns if own else 0  # frames whose n-step return is not there yet
-        capacity = buffer.capacity - unfinished if own else buffer.storage.max_size
-        if capacity < learning_starts:
-            raise UserError(
-                f"the replay has at most {capacity:,} frames to draw from and updates begin at learning_starts="
-                f"{learning_starts:,}: raise its capacity (--buffer-size) or lower learning_starts (--random-frames, "
-                "--batch-size)"
-            )
-        if total_frames is not None and total_frames < learning_starts:
-            raise UserError(
-                f"total_frames={total_frames:,} end before updates begin at learning_starts={learning_starts:,}: raise "
-                "the first or lower the second (--random-frames, --batch-size)"
-            )
         self.loss, self.buffer, self.optimizer = loss, buffer, optimizer
         self.batch_size, self.updates_per_step, self.actor_delay = batch_size, updates_per_step, actor_delay
         self.delay_targets = delay_targets
@@ -98,10 +71,10 @@ class OffPolicyUpdate:
         self.frames = self.updates = 0
         self._due = 0.0
         self._batch: TensorDictBase | None = None
+        own = isinstance(buffer, ReplayBuffer)
+        self._batches: Batches = (OwnBatches if own else TorchRLBatches)(buffer, loss, batch_size)
+        check_settings(LossView(loss), vars(self) | {"capacity": self._batches.capacity})
         self._average, self._copy_statistics = averaging(loss, tau), copying(loss)
-        self._batches: Batches = (
-            OwnBatches(buffer, loss, batch_size) if own else TorchRLBatches(buffer, loss, batch_size)
-        )
         self._steps: dict[bool, GradientStep] = {}
 
     def __call__(self, rollout: TensorDictBase) -> dict[str, float]:
@@ -147,6 +120,10 @@ class OffPolicyUpdate:
                     metrics[name] = metrics.get(name, 0.0) + (share if both else 1.0) * mean
         return metrics
 
+    @property
+    def _view(self) -> LossView:
+        return LossView(self.loss, None, type(self.buffer).__name__)
+
     def __str__(self) -> str:
         norm = f"gradient norm at most {self.max_grad_norm:g}, " if self.max_grad_norm is not None else ""
         delay = f"the actor once in {self.actor_delay} steps, " if self.actor_delay > 1 else ""
@@ -155,7 +132,7 @@ class OffPolicyUpdate:
             f"{self.updates_per_step:g} a frame after {self.learning_starts:,} frames, batches of {self.batch_size}, "
             f"{delay}{tau}{norm}compile {self.compile}"
         )
-        return diagram(self, Chain(self.loss, None, type(self.buffer).__name__), step, self._batch)
+        return diagram(self, self._view, self.optimizer, step, self._batch)
 
     @property
     def compile_seconds(self) -> float:
@@ -179,8 +156,7 @@ class OffPolicyUpdate:
 
     def _assemble(self, data: TensorDictBase, index: Tensor) -> None:
         batch = self._batches.gather(data, index)
-        source, owners = type(self.buffer).__name__, self._batches.settings()
-        names = wiring.check(self.loss, None, self.optimizer, batch, source, owners)
+        names = assembly(self._view, self.optimizer, batch, owners_of_gamma=self._batches.settings())
         self._batch = batch
         steps = None if self.total_frames is None else self.total_frames * self.updates_per_step
         settings: dict[str, Any] = {
@@ -215,5 +191,5 @@ class OffPolicyUpdate:
 
         reached = restoring.undone(self.loss.buffers(), trial)
         if not reached:
-            raise UserError(f"actor_delay needs a critics' loss (loss_qvalue), {type(self.loss).__name__} has none")
+            raise UserError(f"actor_delay needs a critics' loss (loss_qvalue), {self._view.name} has none")
         return reached

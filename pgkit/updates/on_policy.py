@@ -13,18 +13,15 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
+from pgkit.checks import LossView, assembly, check_settings, diagram
 from pgkit.compiling import check_compile, worth_compiling
 from pgkit.constants import Constants
-from pgkit.errors import UserError, whole, within
+from pgkit.errors import UserError
 from pgkit.functional import standardize
-from pgkit.updates import restoring, wiring
-from pgkit.updates.chain import Chain
-from pgkit.updates.diagram import diagram
-from pgkit.updates.entries import another_policy
-from pgkit.updates.estimating import estimated
+from pgkit.updates import restoring
 from pgkit.updates.optimizers import check_optimizer
 from pgkit.updates.recorded import Block, recorded_block
-from pgkit.updates.sequences import as_rows, check_one_memory, check_time
+from pgkit.updates.sequences import as_rows
 from pgkit.updates.step import GradientStep
 
 
@@ -73,38 +70,13 @@ class OnPolicyUpdate:
     ) -> None:
         check_optimizer(optimizer)
         check_compile(compile)
-        whole(1, epochs=epochs, minibatch_size=minibatch_size, sequence_length=sequence_length)
-        within(0, float("inf"), target_kl=target_kl)
-        if schedules and total_frames is None:
-            raise UserError("schedules are functions of the progress: give total_frames too")
-        schedules = schedules or {}
-        for name in schedules:
-            if not callable(schedules[name]):
-                raise UserError(
-                    f"schedules: '{name}' is {schedules[name]!r}, give a function of the progress in [0, 1] "
-                    "(controllers.linear)"
-                )
-            if name != "lr" and not isinstance(getattr(loss, name, None), Tensor):
-                names = sorted(getattr(loss, "_schedulable_buffers", ()))
-                known = ["lr", *[key for key in names if isinstance(getattr(loss, key, None), Tensor)]]
-                raise UserError(
-                    f"schedules: {type(loss).__name__} has no coefficient '{name}', only {', '.join(known)}"
-                )
-        if normalize_advantage and getattr(loss, "normalize_advantage", False):
-            raise UserError(
-                f"{type(loss).__name__} normalizes the advantage already: leave normalize_advantage out here"
-            )
-        if sequence_length and minibatch_size and minibatch_size % sequence_length:
-            raise UserError(
-                f"minibatch_size={minibatch_size} is not a multiple of sequence_length={sequence_length}: a minibatch "
-                "is made of whole sequences"
-            )
         self.loss, self.advantage, self.optimizer = loss, advantage, optimizer
         self.sequence_length = sequence_length
         self.epochs, self.minibatch_size, self.max_grad_norm = epochs, minibatch_size, max_grad_norm
         self.recompute_advantage, self.normalize_advantage = recompute_advantage, normalize_advantage
         self.target_kl, self.schedules, self.total_frames = target_kl, dict(schedules or {}), total_frames
         self.compile, self.frames = compile, 0
+        check_settings(self._view, vars(self))
         self._generator = torch.Generator().manual_seed(int(torch.randint(2**62, ())) if seed is None else seed)
         self._step: GradientStep | None = None
         self._keys: list[Any] = []
@@ -119,8 +91,6 @@ class OnPolicyUpdate:
 
         Time is the last dimension: flattened, an advantage would run from one environment into the next.
         """
-        if self._step is None and self.advantage is not None:
-            check_time(rollout)
         self._follow_schedules()
         length = self.sequence_length or 1
         rows = rollout.numel() // length
@@ -131,7 +101,7 @@ class OnPolicyUpdate:
             if epoch == 1 or self.recompute_advantage:
                 flat = self._flatten(rollout) if epoch == 1 else self._flatten(rollout).update(flat.select(*self._old))
             if self._step is None:
-                self._step = self._assemble(flat, size, rows)
+                self._step = self._assemble(rollout, flat, size)
             if epoch == 1:
                 self._step.begin()
             order = torch.randperm(rows, generator=self._generator).to(flat.device or "cpu")
@@ -149,11 +119,15 @@ class OnPolicyUpdate:
             "learning_rate": float(self.optimizer.param_groups[0]["lr"]),
         }
 
+    @property
+    def _view(self) -> LossView:
+        return LossView(self.loss, self.advantage)
+
     def __str__(self) -> str:
         size = self.minibatch_size or "the whole rollout"
         norm = f"gradient norm at most {self.max_grad_norm:g}, " if self.max_grad_norm is not None else ""
         step = f"{self.epochs} epochs of minibatches of {size}, {norm}compile {self.compile}"
-        return diagram(self, Chain(self.loss, self.advantage), step, self._batch)
+        return diagram(self, self._view, self.optimizer, step, self._batch)
 
     @property
     def compile_seconds(self) -> float:
@@ -184,11 +158,10 @@ class OnPolicyUpdate:
         """The advantage, then the entries that the loss reads as ``[rows, ...]``."""
         if self.advantage is not None and (self._estimate is None or (self._held and self._held.changed())):
             self._estimate = self._prepare(self.advantage, rollout)
-        rollout = estimated(self.loss, self._estimate, rollout)
+        rollout = self._view.estimated(rollout, self._estimate)
         if self._step is None:
-            self._keys = wiring.read_keys(self.loss, rollout)
-            chain = Chain(self.loss, None)
-            anchors = [*chain.keys("value"), *chain.keys("sample_log_prob")]
+            self._keys = self._view.readable(rollout)
+            anchors = [*self._view.keys("value"), *self._view.keys("sample_log_prob")]
             self._old = [key for key in anchors if key in self._keys]
         return as_rows(rollout.select(*self._keys), self.sequence_length)
 
@@ -196,7 +169,7 @@ class OnPolicyUpdate:
         """The advantage block, compiled where it is a good part of the update: a few steps a rollout."""
         few = self.epochs * rollout.numel() <= 4 * (self.minibatch_size or rollout.numel())
         rollouts = None if self.total_frames is None else self.total_frames / rollout.numel()
-        if not (few and getattr(advantage, "recordable", False) and worth_compiling(self.compile, rollouts, 5_000)):
+        if not (few and self._view.recordable and worth_compiling(self.compile, rollouts, 5_000)):
             return advantage
         start = time.perf_counter()
         self._held = Constants(cast(nn.Module, advantage))
@@ -208,14 +181,11 @@ class OnPolicyUpdate:
         finally:
             self._estimate_seconds += time.perf_counter() - start
 
-    def _assemble(self, flat: TensorDictBase, size: int, rows: int) -> GradientStep:
+    def _assemble(self, rollout: TensorDictBase, flat: TensorDictBase, size: int) -> GradientStep:
         self._batch = flat[:size]
-        check_one_memory(self.loss, self.advantage)
-        names = wiring.check(self.loss, self.advantage, self.optimizer, self._batch)
-        reason = another_policy(Chain(self.loss, self.advantage), self._batch)
-        if reason and not self.frames:  # a resumed collector may have collected with older weights
-            getLogger("pgkit").warning(reason)
-        per_rollout = self.epochs * -(-rows // size)
+        resumed = self.frames > 0
+        names = assembly(self._view, self.optimizer, self._batch, rollout=rollout, resumed=resumed)
+        per_rollout = self.epochs * -(-len(flat) // size)
         steps = None if self.total_frames is None else self.total_frames / flat.numel() * per_rollout
         return GradientStep(
             self.loss,
@@ -234,15 +204,15 @@ class OnPolicyUpdate:
                 for group in self.optimizer.param_groups:
                     group["lr"] = value
             else:
-                getattr(self.loss, name).fill_(value)
+                cast(Tensor, self._view.coefficient(name)).fill_(value)
 
     def _kl(self, results: list[Tensor]) -> float:
         assert self._step is not None
         names = [name for name in ("approx_kl", "kl_approx") if name in self._step.names]
         if not names:
-            raise UserError(f"target_kl needs a loss that reports approx_kl; {type(self.loss).__name__} does not")
+            raise UserError(f"target_kl needs a loss that reports approx_kl; {self._view.name} does not")
         return float(torch.stack(results).mean(0)[self._step.names.index(names[0])])
 
     def _standardize_advantage(self, batch: TensorDictBase) -> TensorDictBase:
-        key = getattr(getattr(self.loss, "tensor_keys", None), "advantage", "advantage")
+        key = self._view.key("advantage") or "advantage"
         return batch.copy().set(key, standardize(batch[key]))

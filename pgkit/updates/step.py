@@ -14,11 +14,11 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
+from pgkit.checks import is_loss
 from pgkit.compiling import computed_once
 from pgkit.constants import Constants
 from pgkit.errors import UserError
 from pgkit.updates import optimizers
-from pgkit.updates.chain import is_loss
 from pgkit.updates.recorded import Step, recorded
 
 

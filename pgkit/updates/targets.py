@@ -7,22 +7,16 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
+from pgkit.checks import LossView
+
 Pairs = list[tuple[Tensor, Tensor]]
 
 
 def target_pairs(loss: nn.Module) -> Pairs:
-    """``(target, source)`` for every tensor of the loss's ``target_*_params`` that has a storage of its own.
-
-    The loss is told that its targets are taken care of, as TorchRL's ``SoftUpdate`` does.
-    """
-    associated = getattr(loss, "_has_update_associated", {})
-    for name in associated:
-        associated[name] = True
+    """``(target, source)`` for every tensor of the loss's ``target_*_params`` that has a storage of its own."""
     pairs = []
-    for name, target in loss.named_children():
-        if name.startswith("target_") and name.endswith("_params"):
-            source = getattr(loss, name.removeprefix("target_"))
-            pairs += [(target.get(key), source.get(key)) for key in target.keys(True, True)]
+    for target, source in LossView(loss).delayed():
+        pairs += [(target.get(key), source.get(key)) for key in target.keys(True, True)]
     apart = [(target, source) for target, source in pairs if target.data_ptr() != source.data_ptr()]
     # a compiled graph loses writes to a float64 scalar (a normalizer's count): a scalar buffer is a vector of one here
     scalar = [target.dim() == 0 and not source.requires_grad for target, source in apart]

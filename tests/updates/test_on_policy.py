@@ -33,8 +33,10 @@ def make_rollout(seed=0, dtype=torch.float32, rows=(2, 64)):
         return torch.randn(*rows, *size, generator=g, dtype=dtype)
 
     done = draw(1) > 2
-    next_td = {"observation": draw(3), "reward": draw(1), "done": done, "terminated": done}
-    data = {"observation": draw(3), "action": draw(1), "action_log_prob": draw() * 0.1 - 1, "next": next_td}
+    observation, final = draw(3), draw(3)
+    after = torch.where(done, final, torch.cat([observation[:, 1:], final[:, -1:]], 1))
+    next_td = {"observation": after, "reward": draw(1), "done": done, "terminated": done}
+    data = {"observation": observation, "action": draw(1), "action_log_prob": draw() * 0.1 - 1, "next": next_td}
     return TensorDict(data, rows)
 
 
