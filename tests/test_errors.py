@@ -115,9 +115,11 @@ def test_a_batch_of_another_policy_is_said_but_not_of_one_that_an_earlier_phase_
 
     actor, other = modules.gaussian_actor(ENV, (8,)), modules.gaussian_actor(ENV, (8,), log_std=0.0)
     rollout = collectors.VectorCollector(ENV, actor, frames_per_batch=64, compile="off").rollout()
-    assert not warns(actor, rollout, lr=1.0)  # phase one
     with torch.no_grad():
-        moved = (actor(rollout.select("observation"))["loc"] - rollout["loc"]).abs().max()
+        loc = actor(rollout.select("observation"))["loc"]
+    assert not warns(actor, rollout, lr=100.0)  # phase one
+    with torch.no_grad():
+        moved = (actor(rollout.select("observation"))["loc"] - loc).abs().max()
     assert moved > 0.01 and not warns(actor, rollout)  # phase two, with an update of its own
     assert warns(other, rollout)
 

@@ -54,8 +54,7 @@ def assembly(
     with untouched([*view.loss.parameters(), *view.loss.buffers()]):  # a forward pass may update statistics
         out = _trial(view, batch)
         _check_result(view, batch, out)
-        if reason := entries.wrong_action(view, batch):
-            raise UserError(reason)
+        entries.check_action(view, batch)
         total = torch.stack([out[key].sum() for key in out.keys() if is_loss(key)]).sum()
         owners.check_parameters(view, optimizer, total)
         _warn_of_another_policy(view, batch, resumed)
@@ -70,13 +69,11 @@ def _trial(view: LossView, batch: TensorDictBase) -> TensorDictBase:
     except UserError:
         raise
     except (KeyError, ValueError, TypeError, RuntimeError, IndexError) as error:
-        reason = explain.explain(view, batch, error)
-        if reason is None:
-            raise
-        raise UserError(reason) from error
+        explain.explain(view, batch, error)
+        raise
     if view.estimator is not estimator and view.lacks_advantage(batch):  # it would take a minibatch's rows for steps
         view.estimator = estimator
-        raise UserError(explain.unwritten(view, view.key("advantage")))
+        raise explain.unwritten(view, view.key("advantage"))
     return out
 
 
@@ -85,8 +82,7 @@ def _without_broadcasts(view: LossView, batch: TensorDictBase) -> TensorDictBase
         with NoBroadcasts(view.name):
             return view.loss(batch.copy())
     except BroadcastError as error:
-        if reason := entries.wrong_action(view, batch):
-            raise UserError(reason) from error
+        entries.check_action(view, batch)
         try:
             with NoBroadcasts(view.name):  # with fewer rows, as a network may have as many features
                 view.loss(batch[:-1])

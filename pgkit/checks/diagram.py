@@ -10,7 +10,7 @@ from torch.optim import Optimizer
 
 from pgkit.checks.keys import is_loss, is_next, shape, show
 from pgkit.checks.owners import parameters
-from pgkit.checks.view import LossView, name_of, setting
+from pgkit.checks.view import LossView, keys_of, name_of, setting
 
 
 def diagram(
@@ -40,7 +40,7 @@ def diagram(
 
 
 def _table(view: LossView, batch: TensorDictBase | None) -> list[str]:
-    before, after = view.estimated_from, view.estimates
+    before, after = keys_of(view.advantage, "in_keys"), view.estimates
     read = [key for key in view.reads() if view.advantage is None or not is_next(key)]
     read += [key for key in map(view.key, ("advantage", "value_target")) if key in after]
     keys = [key for key in dict.fromkeys([*read, *before, *after]) if key != "_"]

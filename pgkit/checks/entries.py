@@ -41,27 +41,26 @@ def check_form(view: LossView, batch: TensorDictBase) -> None:
             raise wrong(view, key, shape(x), str(rows(batch, key)), advice)
 
 
-def wrong_action(view: LossView, batch: TensorDictBase) -> str | None:
-    """The batch's actions against the actor's distribution: their kind, shape and bounds; None if all is well."""
+def check_action(view: LossView, batch: TensorDictBase) -> None:
+    """The batch's actions against the actor's distribution: their kind, shape and bounds."""
     keys, dist = view.keys("action"), view.distribution(batch)
     action = batch.get(keys[0], None) if len(keys) == 1 else None
     sample = None if dist is None else dist.sample()
     if not isinstance(action, Tensor) or not isinstance(sample, Tensor):
-        return None
+        return
     reader = f"the actor's {type(dist).__name__}"
     if sample.shape != action.shape or sample.dtype.is_floating_point != action.dtype.is_floating_point:
         found, expected = (f"{shape(x)} {kind(x)}" for x in (action, sample))
-        return str(wrong(view, keys[0], found, expected, "was the actor built for this environment?", reader))
+        raise wrong(view, keys[0], found, expected, "was the actor built for this environment?", reader)
     low, high = bounds(dist)
     if low is None or high is None or not action.numel():
-        return None
+        return
     slack = 1e-4
     if (action < low - slack).any() or (action > high + slack).any():
         found = f"between {action.min():g} and {action.max():g}"
         expected = f"between {torch.as_tensor(low).min():g} and {torch.as_tensor(high).max():g}"
         advice = "build the actor from the environment that collects, or clip the stored actions"
-        return str(wrong(view, keys[0], found, expected, advice, reader))
-    return None
+        raise wrong(view, keys[0], found, expected, advice, reader)
 
 
 def another_policy(view: LossView, batch: TensorDictBase) -> str | None:

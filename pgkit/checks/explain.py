@@ -7,44 +7,43 @@ from typing import Any
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from pgkit.checks.entries import wrong, wrong_action
-from pgkit.checks.keys import is_next, kind, last, shape, show, show_all
+from pgkit.checks.entries import check_action, wrong
+from pgkit.checks.keys import is_next, kind, last, shape, show
 from pgkit.checks.view import LossView, run
+from pgkit.errors import UserError
 from pgkit.seams import KeepsDistribution
 
 
-def explain(view: LossView, batch: TensorDictBase, error: Exception) -> str | None:
-    """Why the loss could not take the batch, as one line; None where there is nothing better to say than ``error``."""
+def explain(view: LossView, batch: TensorDictBase, error: Exception) -> None:
+    """Raises why the loss could not take the batch, unless there is nothing better to say than ``error``."""
     for name, (net, params) in view.networks().items():
         missing = [key for key in net.in_keys if key not in batch.keys(True) and key != "_"]
         if missing:
-            return _missing(view, batch, missing[0], f"{name} of {view.name}")
-        if reason := _refused(view, batch, name, net, params):
-            return reason
+            raise _missing(view, batch, missing[0], f"{name} of {view.name}")
+        _check_inputs(view, batch, name, net, params)
     text = " ".join(map(str, error.args))
     named = [key for key in view.in_keys if last(key) in text and key not in batch.keys(True)]
     if named:
-        return _missing(view, batch, max(named, key=lambda key: len(show(key))), view.name)  # one may begin another
-    if reason := wrong_action(view, batch):
-        return reason
+        raise _missing(view, batch, max(named, key=lambda key: len(show(key))), view.name)  # one may begin another
+    check_action(view, batch)
     if isinstance(error, KeyError):
         text += "; what forward reads besides is named in loss.in_keys (override _reads)"
     elif not isinstance(error, ValueError | TypeError):
-        return None
+        return
     present = ", ".join(f"{show(key)} {shape(batch[key])}" for key in batch.keys(True, True))
-    return f"{view.name} cannot read its batch: {text}. The batch has {present}"
+    raise UserError(f"{view.name} cannot read its batch: {text}. The batch has {present}")
 
 
-def unwritten(view: LossView, key: Any) -> str:
-    """Why there is no advantage, or no value target, where there is no advantage block."""
-    return (
+def unwritten(view: LossView, key: Any) -> UserError:
+    """There is no advantage, or no value target, as there is no advantage block."""
+    return UserError(
         f"the rollout has no '{show(key)}', which {view.name} reads; nothing writes it, as there is no advantage "
         "block: add advantage=advantages.GAE(critic)"
     )
 
 
-def _refused(view: LossView, batch: TensorDictBase, name: str, net: Any, params: Any) -> str | None:
-    """Why a network cannot take its entries."""
+def _check_inputs(view: LossView, batch: TensorDictBase, name: str, net: Any, params: Any) -> None:
+    """Whether a network can take its entries."""
     entries = batch.select(*net.in_keys)
     try:
         run(net, params, lambda: net(entries.copy()))
@@ -56,19 +55,18 @@ def _refused(view: LossView, batch: TensorDictBase, name: str, net: Any, params:
                 continue
             if x.device != weight.device:
                 advice = f"move one of them, x.to('{weight.device}')"
-                return str(wrong(view, key, f"on {x.device}", f"on {weight.device}", advice))
+                raise wrong(view, key, f"on {x.device}", f"on {weight.device}", advice) from error
             if x.dtype.is_floating_point and x.dtype != weight.dtype:
                 advice = "convert it (TorchRL: DoubleToFloat), or the network with .to(dtype)"
-                return str(wrong(view, key, kind(x), kind(weight), advice))
+                raise wrong(view, key, kind(x), kind(weight), advice) from error
         found = ", ".join(f"'{show(key)}' {shape(entries[key])}" for key in net.in_keys)
-        return (
+        raise UserError(
             f"{name} of {view.name} cannot take {found} ({str(error).splitlines()[0]}); written by "
             f"{view.origin(net.in_keys[0])}: was the network built for this environment?"
-        )
-    return None
+        ) from error
 
 
-def _missing(view: LossView, batch: TensorDictBase, key: Any, reader: str) -> str:
+def _missing(view: LossView, batch: TensorDictBase, key: Any, reader: str) -> UserError:
     if key in (view.key("advantage"), view.key("value_target")):
         if view.advantage is None:
             return unwritten(view, key)
@@ -84,4 +82,5 @@ def _missing(view: LossView, batch: TensorDictBase, key: Any, reader: str) -> st
         advice = "a parameter of the distribution that acted: update(loss.keep_distribution(rollout)) writes it"
     else:
         advice = f"{view.origin(key)} should write it: use one name, or loss.set_keys(...), or in_keys=[...]"
-    return f"the batch has no '{show(key)}', which {reader} reads; {advice}. The batch has {show_all(batch)}"
+    present = ", ".join(map(show, batch.keys(True, True)))
+    return UserError(f"the batch has no '{show(key)}', which {reader} reads; {advice}. The batch has {present}")

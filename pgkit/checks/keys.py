@@ -38,11 +38,6 @@ def show(key: Any) -> str:
     return ".".join([*group(key), last(key)])
 
 
-def show_all(batch: TensorDictBase) -> str:
-    """The entries of a batch, in one line."""
-    return ", ".join(show(key) for key in batch.keys(True, True))
-
-
 def shape(x: Tensor) -> str:
     """A shape as ``(64, 1)``."""
     return str(tuple(x.shape))

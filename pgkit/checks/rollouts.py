@@ -25,6 +25,8 @@ def check_order(view: LossView, rollout: TensorDictBase) -> None:
     """
     *envs, steps = rollout.batch_size
     time, present = len(envs), set(rollout.keys(True, True))
+    if steps < 2:
+        return
 
     def rows(key: Any, start: int) -> Tensor:  # all steps but one, [*envs, steps - 1, features]
         return rollout[key].narrow(time, start, steps - 1).reshape(*envs, steps - 1, -1)
@@ -36,7 +38,7 @@ def check_order(view: LossView, rollout: TensorDictBase) -> None:
         free |= ~(rows(key, 0).all(-1) & rows(key, 1).all(-1))
     for key in view.inputs:
         after = following(key)
-        if steps < 2 or not {key, after} <= present or view.writer(after) != "environment":
+        if not {key, after} <= present or view.writer(after) != "environment":
             continue
         reached, seen = rows(after, 0), rows(key, 1)
         differ = (reached != seen) & ((reached == reached) | (seen == seen))  # one NaN is as good as another

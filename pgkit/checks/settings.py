@@ -6,25 +6,16 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from pgkit.checks.owners import parameters
-from pgkit.checks.view import LossView
+from pgkit.checks.view import LossView, setting
 from pgkit.errors import UserError, check_whole_number, within
 from pgkit.seams import KeepsDistribution
 
 ANY = float("inf")
-WHOLE_NUMBERS = {  # name: least
-    "epochs": 1,
-    "minibatch_size": 1,
-    "sequence_length": 1,
-    "batch_size": 1,
-    "actor_delay": 1,
-    "cg_steps": 1,
-}
-NUMBERS = {  # name: least, greatest
-    "target_kl": (0, ANY),
-    "tau": (0, 1),
-    "updates_per_step": (0, ANY),
-    "max_kl": (0, ANY),
-    "damping": (0, ANY),
+COUNTS = ("epochs", "minibatch_size", "sequence_length", "batch_size", "actor_delay", "cg_steps")
+BOUNDS = {  # name: least, greatest, kind
+    **dict.fromkeys(COUNTS, (1, ANY, int)),
+    **dict.fromkeys(("target_kl", "updates_per_step", "max_kl", "damping"), (0, ANY, float)),
+    "tau": (0, 1, float),
 }
 
 
@@ -34,10 +25,9 @@ def check_settings(view: LossView, settings: Mapping[str, Any]) -> None:
     Raises:
         UserError: a setting is out of bounds, or contradicts another, the loss or the replay.
     """
-    for name, least in WHOLE_NUMBERS.items():
-        check_whole_number(least, **{name: settings.get(name)})
-    for name, (low, high) in NUMBERS.items():
-        within(low, high, **{name: settings.get(name)})
+    for name, (low, high, kind) in BOUNDS.items():
+        given = {name: settings.get(name)}
+        check_whole_number(low, **given) if kind is int else within(low, high, **given)
     for contradictions in (_of_schedules, _of_minibatches, _of_replays, _of_trust_regions):
         for message in contradictions(view, settings):
             raise UserError(message)
@@ -52,14 +42,14 @@ def _of_schedules(view: LossView, settings: Mapping[str, Any]) -> Iterator[str]:
             yield (
                 f"schedules: '{name}' is {schedule!r}, give a function of the progress in [0, 1] (controllers.linear)"
             )
-        if name != "lr" and view.coefficient(name) is None:
-            known = ", ".join(["lr", *view.coefficients()])
+        if name not in ["lr", *view.coefficients()]:
+            known = ", ".join(["lr", *sorted(view.coefficients())])
             yield f"schedules: {view.name} has no coefficient '{name}', only {known}"
 
 
 def _of_minibatches(view: LossView, settings: Mapping[str, Any]) -> Iterator[str]:
     size, length = settings.get("minibatch_size"), settings.get("sequence_length")
-    if settings.get("normalize_advantage") and view.normalizes_advantage:
+    if settings.get("normalize_advantage") and setting(view.loss, "normalize_advantage"):
         yield f"{view.name} normalizes the advantage already: leave normalize_advantage out here"
     if size and length and size % length:
         yield (

@@ -28,13 +28,21 @@ class LossView:
         loss: the loss.
         advantage: the advantage block, or None.
         source: what hands the batch over: ``the rollout``, or the name of a replay buffer.
+
+    Attributes:
+        name, advantage_name: what a message calls the two.
+        in_keys, out_keys: what the loss says it reads, and that its result has; nothing where it does not say.
+        inputs: what the loss's networks read.
+        estimates: what the advantage block writes.
     """
 
     def __init__(self, loss: nn.Module, advantage: Any = None, source: str = "the rollout") -> None:
         self.loss, self.advantage, self.source = loss, advantage, source
         self.name, self.advantage_name = name_of(loss), name_of(advantage)
-
-    # ---- networks
+        self.in_keys, self.out_keys = keys_of(loss, "in_keys"), keys_of(loss, "out_keys")
+        self.inputs = list(dict.fromkeys(key for net, _ in self.networks().values() for key in net.in_keys))
+        expected = [] if advantage is None else [*self.keys("advantage"), *self.keys("value_target")]
+        self.estimates = keys_of(advantage, "out_keys") or expected  # of a function: what the loss expects of it
 
     def networks(self) -> dict[str, tuple[Any, Any]]:
         """``name -> (module, parameters)`` of the networks that a TorchRL loss holds; of a stack the first member."""
@@ -68,8 +76,6 @@ class LossView:
             return None
         return run(net, params, lambda: net.get_dist(batch.select(*net.in_keys, strict=False)))
 
-    # ---- entries
-
     def key(self, name: str) -> Any:
         """The entry that the loss knows as ``name`` (its ``tensor_keys``), or None."""
         return getattr(self.loss.tensor_keys, name, None) if isinstance(self.loss, LossModule) else None
@@ -78,32 +84,6 @@ class LossView:
         """The entries of :meth:`key`: none, one, or those of a composite action's parts."""
         key = self.key(name)
         return key if isinstance(key, list) else [] if key is None else [key]
-
-    @property
-    def in_keys(self) -> list[Any]:
-        """What the loss says it reads; nothing where it does not say."""
-        return _keys(self.loss, "in_keys")
-
-    @property
-    def out_keys(self) -> list[Any]:
-        """What the loss says its result has; nothing where it does not say."""
-        return _keys(self.loss, "out_keys")
-
-    @property
-    def inputs(self) -> list[Any]:
-        """What the loss's networks read."""
-        return list(dict.fromkeys(key for net, _ in self.networks().values() for key in net.in_keys))
-
-    @property
-    def estimated_from(self) -> list[Any]:
-        """What the advantage block says it reads."""
-        return _keys(self.advantage, "in_keys")
-
-    @property
-    def estimates(self) -> list[Any]:
-        """What the advantage block writes: what it says, or for a function what the loss expects of it."""
-        expected = [] if self.advantage is None else [*self.keys("advantage"), *self.keys("value_target")]
-        return _keys(self.advantage, "out_keys") or expected
 
     @property
     def distribution_keys(self) -> list[Any]:
@@ -122,7 +102,7 @@ class LossView:
     def reads(self) -> list[Any]:
         """The loss's ``in_keys``; of a loss without any, what its networks and a one-step target read."""
         if self.in_keys:
-            return self.in_keys
+            return [*self.in_keys]
         actions = self.keys("action")
         after = [key for key in self.inputs if key not in actions]
         after += [key for name in ("reward", "done", "terminated") for key in self.keys(name)]
@@ -131,7 +111,7 @@ class LossView:
     def readable(self, data: TensorDictBase) -> list[Any]:
         """Entries of ``data`` that the loss may read: its ``in_keys``, its configurable keys, masks; those present."""
         present = set(data.keys(True, True))
-        keys = self.in_keys or list(present)
+        keys = [*(self.in_keys or present)]
         if isinstance(self.loss, LossModule):
             keys += [key for field in fields(self.loss.tensor_keys) for key in self.keys(field.name)]
         keys += [*self.masks, *self.distribution_keys, "steps_to_next_obs"]  # the last: read by TorchRL's estimators
@@ -159,8 +139,6 @@ class LossView:
         writer = self.writer(key)
         return f"{'the environment' if writer == 'environment' else writer} (in {self.source})"
 
-    # ---- settings
-
     @property
     def gamma(self) -> Any:
         """The loss's discount: its own ``gamma``, or its value estimator's."""
@@ -177,26 +155,13 @@ class LossView:
         return self.key("priority") or "td_error"
 
     @property
-    def normalizes_advantage(self) -> bool:
-        """Whether the loss standardizes the advantage of each minibatch itself."""
-        return bool(getattr(self.loss, "normalize_advantage", False))
-
-    @property
     def recordable(self) -> bool:
         """Whether the advantage block says that it may be recorded as tensor operations."""
-        return bool(getattr(self.advantage, "recordable", False))
+        return bool(setting(self.advantage, "recordable"))
 
-    def coefficient(self, name: str) -> Tensor | None:
-        """The loss's coefficient of this name; None if it has none that can change under way."""
-        value = getattr(self.loss, name, None)
-        return value if isinstance(value, Tensor) else None
-
-    def coefficients(self) -> list[str]:
-        """Names of the coefficients that a TorchRL loss declares."""
-        declared = self.loss._schedulable_buffers if isinstance(self.loss, LossModule) else ()
-        return [name for name in sorted(declared) if self.coefficient(name) is not None]
-
-    # ---- the advantage
+    def coefficients(self) -> dict[str, Tensor]:
+        """The loss's coefficients that can change under way, by name."""
+        return dict(self.loss.named_buffers(recurse=False))
 
     @property
     def estimator(self) -> Any:
@@ -293,5 +258,6 @@ def untouched(tensors: Any) -> Iterator[None]:
                 tensor.copy_(value)
 
 
-def _keys(block: Any, name: str) -> list[Any]:
+def keys_of(block: Any, name: str) -> list[Any]:
+    """The ``in_keys`` or ``out_keys`` of a block; none of a function."""
     return list(getattr(block, name, None) or ())

@@ -204,7 +204,7 @@ class OnPolicyUpdate:
                 for group in self.optimizer.param_groups:
                     group["lr"] = value
             else:
-                cast(Tensor, self._view.coefficient(name)).fill_(value)
+                self._view.coefficients()[name].fill_(value)
 
     def _kl(self, results: list[Tensor]) -> float:
         assert self._step is not None

@@ -34,9 +34,7 @@ def rollout_of(actor, size, seed=0):
     rollout = actor(TensorDict({"observation": draw(size)}, [4, 64])).detach()
     done = draw(1) > 2
     after = torch.where(done, draw(size), rollout["observation"].roll(-1, 1))
-    rollout["next"] = TensorDict(
-        {"observation": after, "reward": draw(1), "done": done, "terminated": done}, [4, 64]
-    )
+    rollout["next"] = TensorDict({"observation": after, "reward": draw(1), "done": done, "terminated": done}, [4, 64])
     return rollout
 
 
