@@ -162,10 +162,10 @@ def read(table: Path, columns: Sequence[str] = COLUMNS) -> list[dict[str, str]]:
     try:
         with table.open(newline="") as file:
             reader = csv.DictReader(file)
-            rows = list(reader)
+            names, rows = reader.fieldnames or (), list(reader)
     except (OSError, ValueError, csv.Error) as error:
         raise UserError(f"{table} cannot be read: {error}") from error
-    if missing := [name for name in columns if name not in (reader.fieldnames or ())]:
+    if missing := [name for name in columns if name not in names]:
         raise UserError(f"{table} is no results table: it has no column '{missing[0]}'")
     for number, r in enumerate(rows, 2):
         if None in r or None in r.values():
