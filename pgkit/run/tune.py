@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -78,12 +79,12 @@ def tune(
         scores, step = [], 0
         for seed in seeds:
             cell = Cell(recipe, env, seed, (*flags, *as_flags(chosen)), folder / f"trial{trial.number}")
-            for score in _evaluations(cell):
-                trial.report(score, step)
-                step += 1
-                if trial.should_prune():
-                    _end(cell)
-                    raise optuna.TrialPruned
+            with closing(_evaluations(cell)) as evaluations:
+                for score in evaluations:
+                    trial.report(score, step)
+                    step += 1
+                    if trial.should_prune():
+                        raise optuna.TrialPruned
             if not cell.done:
                 raise optuna.TrialPruned(cell.last_words())
             scores.append(read_json(cell.directory / "summary.json")["eval/mean_reward"])
@@ -96,7 +97,7 @@ def tune(
     return study.best_params, study.best_value
 
 
-def _evaluations(cell: Cell) -> Any:
+def _evaluations(cell: Cell) -> Iterator[float]:
     """Runs a cell; its evaluations as they are written."""
     cell.start()
     seen, ended = 0, False
@@ -109,9 +110,5 @@ def _evaluations(cell: Cell) -> Any:
             seen = len(scores)
             time.sleep(0 if ended else 0.5)
     finally:
-        _end(cell)
-
-
-def _end(cell: Cell) -> None:
-    cell.process.terminate()
-    cell.process.wait()
+        cell.process.terminate()
+        cell.process.wait()
