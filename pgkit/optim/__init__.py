@@ -1,0 +1,21 @@
+"""Optimizers: rules in optax's shape for the compiled graph, and the user's own ``torch.optim`` outside it."""
+
+from pgkit.optim.bound import Bound, bound
+from pgkit.optim.once import computed_once
+from pgkit.optim.optimizers import Together, check_optimizer, parameters, parts, step
+from pgkit.optim.rules import Rule, adam, rmsprop, sgd
+
+__all__ = [
+    "Bound",
+    "Rule",
+    "Together",
+    "adam",
+    "bound",
+    "check_optimizer",
+    "computed_once",
+    "parameters",
+    "parts",
+    "rmsprop",
+    "sgd",
+    "step",
+]
