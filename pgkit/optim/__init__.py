@@ -2,20 +2,6 @@
 
 from pgkit.optim.bound import Bound, bound
 from pgkit.optim.once import computed_once
-from pgkit.optim.optimizers import Together, check_optimizer, parameters, parts, step
-from pgkit.optim.rules import Rule, adam, rmsprop, sgd
+from pgkit.optim.optimizers import Together, check_optimizer, parameters, step
 
-__all__ = [
-    "Bound",
-    "Rule",
-    "Together",
-    "adam",
-    "bound",
-    "check_optimizer",
-    "computed_once",
-    "parameters",
-    "parts",
-    "rmsprop",
-    "sgd",
-    "step",
-]
+__all__ = ["Bound", "Together", "bound", "check_optimizer", "computed_once", "parameters", "step"]

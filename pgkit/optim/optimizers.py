@@ -78,11 +78,12 @@ def step(optimizer: Optimizer | Together, params: Sequence[Tensor], grads: Seque
 
     Adam and AdamW take torch's fused kernel, the fastest, unless the user chose another.
     """
-    optimizer.zero_grad(set_to_none=True)
+    for param in parameters(optimizer):
+        param.grad = None
     for param, grad in zip(params, grads, strict=True):
         param.grad = grad
-    adams = [part for part in parts(optimizer) if type(part) in (Adam, AdamW)]
-    groups = [group for part in adams for group in part.param_groups if _may_be_fused(group)]
+    adams = [group for part in parts(optimizer) if type(part) in (Adam, AdamW) for group in part.param_groups]
+    groups = [g for g in adams if g["fused"] is g["foreach"] is None and not g["differentiable"]]
     for group in groups:
         group["fused"] = True
     try:
@@ -90,7 +91,3 @@ def step(optimizer: Optimizer | Together, params: Sequence[Tensor], grads: Seque
     finally:
         for group in groups:
             group["fused"] = None
-
-
-def _may_be_fused(group: dict[str, Any]) -> bool:
-    return group["fused"] is None and group["foreach"] is None and not group["differentiable"]

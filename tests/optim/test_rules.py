@@ -7,6 +7,7 @@ import torch
 
 from pgkit import optim
 from pgkit.errors import UserError
+from pgkit.optim.rules import adam
 
 OPTIMIZERS = [
     torch.optim.Adam,
@@ -85,7 +86,7 @@ def test_adam_by_hand():
 
 
 def test_a_rule_is_pure():
-    rule = optim.adam(betas=(0.9, 0.999), eps=1e-8, weight_decay=0.1, amsgrad=True, maximize=True)
+    rule = adam(betas=(0.9, 0.999), eps=1e-8, weight_decay=0.1, amsgrad=True, maximize=True)
     params = [p.detach() for p in numbers()]
     states = [rule.init(p) for p in params]
     state = {name: [own[name] for own in states] for name in states[0]}
