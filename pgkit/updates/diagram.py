@@ -8,8 +8,8 @@ from typing import Any
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
+from pgkit.optim import parameters
 from pgkit.updates.chain import Chain, is_loss, shape, show
-from pgkit.updates.optimizers import parameters
 
 
 def diagram(update: Any, chain: Chain, step: str, batch: TensorDictBase | None = None) -> str:

@@ -9,10 +9,11 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
+from pgkit import optim
 from pgkit.compiling import check_compile, worth_compiling
 from pgkit.data import ReplayBuffer
 from pgkit.errors import UserError, whole, within
-from pgkit.updates import optimizers, restoring, wiring
+from pgkit.updates import restoring, wiring
 from pgkit.updates.batches import Batches, OwnBatches, TorchRLBatches
 from pgkit.updates.chain import Chain, is_loss
 from pgkit.updates.diagram import diagram
@@ -62,7 +63,7 @@ class OffPolicyUpdate:
         total_frames: int | None = None,
         compile: str = "auto",
     ) -> None:
-        optimizers.check_optimizer(optimizer)
+        optim.check_optimizer(optimizer)
         check_compile(compile)
         whole(1, batch_size=batch_size, actor_delay=actor_delay)
         within(0, 1, tau=tau)
@@ -202,7 +203,7 @@ class OffPolicyUpdate:
 
     def _critics(self, batch: TensorDictBase) -> dict[str, list[Tensor]]:
         """The critics' loss entries, and the parameters they train: by name, and whatever trains no others."""
-        params = optimizers.parameters(self.optimizer)
+        params = optim.parameters(self.optimizer)
 
         def trial() -> dict[str, list[Tensor]]:
             out, reached = self.loss(batch.copy()), {}

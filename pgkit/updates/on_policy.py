@@ -17,12 +17,12 @@ from pgkit.compiling import check_compile, worth_compiling
 from pgkit.constants import Constants
 from pgkit.errors import UserError, whole, within
 from pgkit.functional import standardize
+from pgkit.optim import check_optimizer
 from pgkit.updates import restoring, wiring
 from pgkit.updates.chain import Chain
 from pgkit.updates.diagram import diagram
 from pgkit.updates.entries import another_policy
 from pgkit.updates.estimating import estimated
-from pgkit.updates.optimizers import check_optimizer
 from pgkit.updates.recorded import Block, recorded_block
 from pgkit.updates.sequences import as_rows, check_one_memory, check_time
 from pgkit.updates.step import GradientStep

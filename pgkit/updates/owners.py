@@ -9,8 +9,8 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from pgkit.errors import UserError
+from pgkit.optim import parameters
 from pgkit.updates.chain import Chain
-from pgkit.updates.optimizers import parameters
 
 
 def check_settings(chain: Chain, others: dict[str, Any]) -> None:

@@ -13,11 +13,11 @@ from torch.optim import SGD, Optimizer
 from pgkit.compiling import check_compile, worth_compiling
 from pgkit.errors import UserError, whole, within
 from pgkit.functional import conjugate_gradient
+from pgkit.optim import check_optimizer, parameters
 from pgkit.updates import restoring, wiring
 from pgkit.updates.chain import Chain
 from pgkit.updates.diagram import diagram
 from pgkit.updates.estimating import estimated
-from pgkit.updates.optimizers import check_optimizer, parameters
 from pgkit.updates.sequences import as_rows, check_time
 from pgkit.updates.step import GradientStep
 
