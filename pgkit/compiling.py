@@ -11,7 +11,7 @@ from typing import Any, cast
 
 import torch
 from torch import Tensor
-from torch.compiler import is_compiling, is_dynamo_compiling
+from torch.compiler import is_dynamo_compiling
 from torch.fx import GraphModule, Node
 from torch.fx.experimental.proxy_tensor import make_fx
 from torch.fx.subgraph_rewriter import replace_pattern
@@ -51,15 +51,6 @@ def worth_compiling(compile: str, calls: float | None, least_calls: float) -> bo
         getLogger("pgkit").warning("no C++ compiler (g++) found: running without torch.compile, about 3 times slower")
         return False
     return calls is None or calls >= least_calls
-
-
-def computed_once(x: Tensor) -> Tensor:
-    """``x`` without gradients, a few numbers that much larger operations read.
-
-    Compiled for a CPU, it is kept in memory: inductor's loops over the larger operations would compute it anew for
-    every vector, and two powers cost more than the rest of Adam.
-    """
-    return torch.ops._inductor_test.realize(x) if is_compiling() and x.device.type == "cpu" else x
 
 
 def record(function: Callable[..., Any], inputs: Sequence[Tensor]) -> GraphModule:

@@ -46,7 +46,7 @@ class Simulator(Protocol):
         device: where its tensors live.
         observation_spec, action_spec, reward_spec, done_spec: TorchRL's, of batch size ``[N]``.
         resume: what :meth:`state_dict` promises: every environment ``exact`` as it was, or ``new episodes``.
-        episode_reward: return so far of the episodes of the last step, before any reset; keyed as rewards.
+        episode_reward: return so far of the episodes that the last step belonged to, before any reset; keyed as reward.
         step_count: their length so far, int64 ``[N]``.
     """
 

@@ -9,8 +9,8 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from pgkit.checks.keys import is_loss, is_next, shape, show
-from pgkit.checks.owners import parameters
 from pgkit.checks.view import LossView, keys_of, name_of, setting
+from pgkit.optim import parameters
 
 
 def diagram(

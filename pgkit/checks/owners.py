@@ -11,6 +11,7 @@ from torch.optim import Optimizer
 
 from pgkit.checks.view import LossView, setting
 from pgkit.errors import UserError
+from pgkit.optim import parameters
 
 
 def check_discounts(view: LossView, others: Mapping[str, Any]) -> None:
@@ -74,11 +75,6 @@ def _check_trained(view: LossView, ids: set[int]) -> None:
             f"of {view.name}'s and in no group of the optimizer; give both the same critic, or freeze this one "
             "(requires_grad_(False))"
         )
-
-
-def parameters(optimizer: Optimizer) -> list[Tensor]:
-    """All parameters of the optimizer, in the order of its groups."""
-    return [p for group in optimizer.param_groups for p in group["params"]]
 
 
 def _more(items: list[Any]) -> str:

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from pgkit.checks.owners import parameters
 from pgkit.checks.view import LossView, setting
 from pgkit.errors import UserError, check_whole_number, within
+from pgkit.optim import check_optimizer, parameters
 from pgkit.seams import KeepsDistribution
 
 ANY = float("inf")
-COUNTS = ("epochs", "minibatch_size", "sequence_length", "batch_size", "actor_delay", "cg_steps")
+COUNTS = ("epochs", "minibatch_size", "sequence_length", "batch_size", "actor_delay", "cg_steps", "accumulate")
 BOUNDS = {  # name: least, greatest, kind
     **dict.fromkeys(COUNTS, (1, ANY, int)),
     **dict.fromkeys(("target_kl", "updates_per_step", "max_kl", "damping"), (0, ANY, float)),
@@ -25,6 +25,8 @@ def check_settings(view: LossView, settings: Mapping[str, Any]) -> None:
     Raises:
         UserError: a setting is out of bounds, or contradicts another, the loss or the replay.
     """
+    if settings["optimizer"] is not None or "max_kl" not in settings:  # a trust region may have none
+        check_optimizer(settings["optimizer"])
     for name, (low, high, kind) in BOUNDS.items():
         given = {name: settings.get(name)}
         check_whole_number(low, **given) if kind is int else within(low, high, **given)

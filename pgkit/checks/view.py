@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import fields
 from functools import partial
 from typing import Any
@@ -239,18 +239,23 @@ def bounds(dist: Any) -> tuple[Any, Any]:
 
 def run(net: Any, params: Any, call: Callable[[], Any]) -> Any:
     """``call()`` with ``params`` in ``net``, without gradients and without a trace."""
-    with torch.no_grad(), untouched(params.values(True, True)), params.to_module(net, preserve_module_state=False):
+    held = list(params.values(True, True))
+    copies = params.apply(lambda x: x if isinstance(x, nn.Parameter) else x.clone())  # statistics may move in these
+    with torch.no_grad(), same_random_numbers(held), copies.to_module(net, preserve_module_state=False):
         return call()
 
 
+def same_random_numbers(tensors: Sequence[Tensor]) -> AbstractContextManager[None]:
+    """What is drawn within, on the CPU and on the devices of these tensors, does not move the random generators."""
+    return torch.random.fork_rng(devices=list({tensor.device for tensor in tensors if tensor.is_cuda}))
+
+
 @contextmanager
-def untouched(tensors: Any) -> Iterator[None]:
+def untouched(tensors: Sequence[Tensor]) -> Iterator[None]:
     """What happens within to those of the tensors that are no parameters, and to random generators, is undone."""
-    tensors = list(tensors)
     before = [(tensor, tensor.detach().clone()) for tensor in tensors if not isinstance(tensor, nn.Parameter)]
-    cuda = list({tensor.device for tensor in tensors if tensor.is_cuda})
     try:
-        with torch.random.fork_rng(devices=cuda):
+        with same_random_numbers(tensors):
             yield
     finally:
         with torch.no_grad():

@@ -9,11 +9,12 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
+from pgkit import optim
 from pgkit.checks import LossView, assembly, check_settings, diagram, is_loss
 from pgkit.compiling import check_compile, worth_compiling
 from pgkit.data import ReplayBuffer
 from pgkit.errors import UserError
-from pgkit.updates import optimizers, restoring
+from pgkit.updates import restoring
 from pgkit.updates.batches import Batches, OwnBatches, TorchRLBatches
 from pgkit.updates.step import GradientStep
 from pgkit.updates.targets import averaging, copying
@@ -61,7 +62,6 @@ class OffPolicyUpdate:
         total_frames: int | None = None,
         compile: str = "auto",
     ) -> None:
-        optimizers.check_optimizer(optimizer)
         check_compile(compile)
         self.loss, self.buffer, self.optimizer = loss, buffer, optimizer
         self.batch_size, self.updates_per_step, self.actor_delay = batch_size, updates_per_step, actor_delay
@@ -178,7 +178,7 @@ class OffPolicyUpdate:
 
     def _critics(self, batch: TensorDictBase) -> dict[str, list[Tensor]]:
         """The critics' loss entries, and the parameters they train: by name, and whatever trains no others."""
-        params = optimizers.parameters(self.optimizer)
+        params = optim.parameters(self.optimizer)
 
         def trial() -> dict[str, list[Tensor]]:
             out, reached = self.loss(batch.copy()), {}

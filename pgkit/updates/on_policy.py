@@ -19,7 +19,6 @@ from pgkit.constants import Constants
 from pgkit.errors import UserError
 from pgkit.functional import standardize
 from pgkit.updates import restoring
-from pgkit.updates.optimizers import check_optimizer
 from pgkit.updates.recorded import Block, recorded_block
 from pgkit.updates.sequences import as_rows
 from pgkit.updates.step import GradientStep
@@ -68,7 +67,6 @@ class OnPolicyUpdate:
         compile: str = "auto",
         seed: int | None = None,
     ) -> None:
-        check_optimizer(optimizer)
         check_compile(compile)
         self.loss, self.advantage, self.optimizer = loss, advantage, optimizer
         self.sequence_length = sequence_length

@@ -14,11 +14,10 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
+from pgkit import optim
 from pgkit.checks import is_loss
-from pgkit.compiling import computed_once
 from pgkit.constants import Constants
 from pgkit.errors import UserError
-from pgkit.updates import optimizers
 from pgkit.updates.recorded import Step, recorded
 
 
@@ -74,13 +73,11 @@ class GradientStep:
         self.compile_seconds = 0.0
         self._runs: dict[Any, Step] = {}
         self._constants: Constants | None = None
-        params = optimizers.parameters(optimizer)
+        params = optim.parameters(optimizer)
         if only is not None:
             kept = {id(p) for reached in only.values() for p in reached}
             params = [p for p in params if id(p) in kept]
-        functional = optimizers.functional(optimizer, fused=not compile, params=params)
-        apply, self._read_learning_rates, self._rates = functional or (None, lambda: None, [])
-        self._in_graph = apply is not None
+        self._rules = rules = optim.bound(optimizer, params) if compile else None
 
         def step(data: TensorDictBase, index: Tensor) -> tuple[Tensor, list[Tensor]]:
             batch = gather(data, index)
@@ -94,14 +91,14 @@ class GradientStep:
                     write_back(data, index, batch)
                 norm = torch.stack([grad.square().sum() for grad in grads]).sum().sqrt()
                 if max_grad_norm is not None:
-                    factor = computed_once((max_grad_norm / (norm + 1e-6)).clamp(max=1.0))
+                    factor = optim.computed_once((max_grad_norm / (norm + 1e-6)).clamp(max=1.0))
                     grads = [grad * factor for grad in grads]
-                if apply is not None:
-                    apply(grads)
+                if rules is not None:
+                    rules.apply(grads)
                     if after is not None:
                         after()
                 metrics = torch.stack([*(out[name].detach().to(norm.dtype).mean() for name in names), norm])
-            return metrics, [] if apply is not None else grads
+            return metrics, [] if rules is not None else grads
 
         # dynamo caches by code object: one of its own keeps each agent's graph apart from every other agent's
         code = step.__code__.replace(co_name=f"step_{id(self)}")
@@ -129,9 +126,8 @@ class GradientStep:
                 changed,
             )
             self._runs, self._constants = {}, None
-        self._read_learning_rates()
-        for part in getattr(self.optimizer, "parts", [self.optimizer]):
-            part._opt_called = True  # what torch's schedulers look at before they warn that none stepped
+        if self._rules is not None:
+            self._rules.read()
 
     def __call__(self, data: TensorDictBase, index: Tensor) -> Tensor:
         """One step on the rows ``index`` of ``data``; metrics ``[len(names)]``, still on the device."""
@@ -153,30 +149,27 @@ class GradientStep:
                 self._fall_back(reason, UserError(f"{reason}; hold it as a tensor, or compile='off'"))
                 self._runs[signature], self._constants = self._eager, None
             self.compile_seconds += time.perf_counter() - start
-        if not self._in_graph:
+        if self._rules is None:
             self._optimizer_step(grads)
         return metrics
 
     def eager(self, data: TensorDictBase, index: Tensor) -> Tensor:
         """The same step outside the graph, for a minibatch of another size."""
         metrics, grads = self._eager(data, index)
-        if not self._in_graph:
+        if self._rules is None:
             self._optimizer_step(grads)
         return metrics
 
     def _optimizer_step(self, grads: list[Tensor]) -> None:
-        self.optimizer.zero_grad(set_to_none=True)
-        for param, grad in zip(self._params, grads, strict=True):
-            param.grad = grad
-        self.optimizer.step()
+        optim.step(self.optimizer, self._params, grads)
         if self._after is not None:
             with torch.no_grad():
                 self._after()
 
     def _build(self, data: TensorDictBase, index: Tensor) -> tuple[Step, tuple[Tensor, list[Tensor]]]:
         """The compiled step for these shapes, and the result of its first call."""
-        states = [x for p in self._params for x in self.optimizer.state.get(p, {}).values() if torch.is_tensor(x)]
-        held = [*self._params, *states, *self._rates, *self.loss.parameters(), *self.loss.buffers(), *self._written]
+        states = [] if self._rules is None else self._rules.tensors
+        held = [*self._params, *states, *self.loss.parameters(), *self.loss.buffers(), *self._written]
         try:
             run = recorded(self._eager, list({id(x): x for x in held}.values()), data, index)
             return run, run(data, index)

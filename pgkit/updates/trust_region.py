@@ -13,8 +13,8 @@ from torch.optim import SGD, Optimizer
 from pgkit.checks import LossView, assembly, check_settings, diagram
 from pgkit.compiling import check_compile, worth_compiling
 from pgkit.functional import conjugate_gradient
+from pgkit.optim import parameters
 from pgkit.updates import restoring
-from pgkit.updates.optimizers import check_optimizer, parameters
 from pgkit.updates.sequences import as_rows
 from pgkit.updates.step import GradientStep
 
@@ -74,8 +74,6 @@ class TrustRegionUpdate:
         compile: str = "auto",
         seed: int | None = None,
     ) -> None:
-        if optimizer is not None:
-            check_optimizer(optimizer)
         check_compile(compile)
         self.loss, self.advantage, self.optimizer = loss, advantage, optimizer
         self.max_kl, self.cg_steps, self.damping = max_kl, cg_steps, damping
