@@ -14,9 +14,10 @@ MAY_IMPORT = {
     "advantages": {"functional", "torch", "tensordict", "torchrl"},
     "controllers": {"functional", "torch"},
     "losses": {"functional", "heads", "torch", "tensordict", "torchrl"},
-    "updates": {"functional", "data", "torch", "tensordict"},
+    "compiled": {"torch", "tensordict"},
+    "updates": {"functional", "compiled", "data", "torch", "tensordict"},
     "data": {"torch", "tensordict", "torchrl"},
-    "collectors": {"envs", "torch", "tensordict", "torchrl"},
+    "collectors": {"envs", "compiled", "torch", "tensordict", "torchrl"},
     "envs": {"gymnasium", "torch", "tensordict", "torchrl"},
     "run": {"torch", "tensordict", "torchrl"},
     "cli": {"run"},
@@ -52,9 +53,9 @@ def loss_modules(path: Path):
 
 
 def outside(folder: str, path: Path):
-    """Imports of ``path`` that the table forbids; pgkit's errors, compiling, constants and a folder's own are free."""
+    """Imports of ``path`` that the table forbids; pgkit's errors, seams and a folder's own are free."""
     governed = THIRD_PARTY | set(MAY_IMPORT)
-    free = {folder, "errors", "compiling", "constants"}
+    free = {folder, "errors", "seams"}
     return {name for name in imports(path) if name in governed} - MAY_IMPORT[folder] - free
 
 

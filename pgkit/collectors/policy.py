@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from logging import getLogger
 from typing import Any
 
 import torch
@@ -11,12 +10,11 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torch.overrides import TorchFunctionMode
 from torchrl.data import MultiCategorical, TensorSpec
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import OrnsteinUhlenbeckProcessModule
 
-from pgkit.compiling import compile_record, record
+from pgkit.compiled import Mode, compiled
 from pgkit.envs import VectorEnv
 from pgkit.envs.vector import whole
 from pgkit.errors import UserError
@@ -49,64 +47,47 @@ def memory(actor: TensorDictModuleBase, num_envs: int) -> dict[str, Tensor]:
 def trace(
     actor: TensorDictModuleBase,
     obs: Tensor,
-    compile: bool = False,
+    mode: Mode = "off",
     split: Callable[[Tensor], dict[str, Tensor]] = whole,
 ) -> Act:
     """A function from observations of the shape of ``obs`` to the tensors at :func:`output_keys`.
 
     A recurrent actor's function takes the entries of :func:`memory` too. ``split`` makes entries of ``obs``.
 
-    It is the actor's own sequence of tensor operations, recorded once (``make_fx``) and called without TensorDict:
-    the same numbers bit for bit, at about a quarter of the cost for a small network. ``compile`` hands the record to
-    inductor, which halves that again and rounds differently in the last bits. Parameters and buffers are referred to,
-    not copied, so weights changed in place take effect; plain attributes are fixed. An actor that cannot be recorded
-    (Python control flow that depends on data, numpy) is called as it is.
+    It is the actor's own sequence of tensor operations, recorded once and called without TensorDict: the same numbers
+    bit for bit, at about a quarter of the cost for a small network. Compiled, it halves that again and rounds
+    differently in the last bits. Parameters and buffers are referred to, not copied, so weights changed in place take
+    effect; plain attributes are fixed. An actor that cannot be recorded (Python control flow that depends on data,
+    numpy) is called as it is.
+
+    Args:
+        mode: of :func:`pgkit.compiled.compiled`; ``off`` records all the same, which changes no bit.
     """
     keys = output_keys(actor)
-
     remembered = memory(actor, len(obs))
-    inputs = [obs, *remembered.values()]
 
-    def act(obs: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
+    def act(_: None, obs: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
         entries = split(obs) | dict(zip(remembered, state, strict=True))
         out = actor(TensorDict(entries, batch_size=obs.shape[:1]))
         return tuple(out[key] for key in keys)
 
-    with torch.no_grad(), torch.random.fork_rng(devices=[]), set_exploration_type(ExplorationType.RANDOM):
-        try:
-            with _LeavesTorch() as leaves:
-                graph = record(act, inputs)
-        except RuntimeError as error:
-            if "proxy" not in str(error) and "trac" not in str(error):
-                raise
-            return act
-        if leaves.seen or not _repeats(graph.forward, act, inputs):
-            getLogger("pgkit").info("the policy computes outside torch: it is called as it is, several times slower")
-            return act
-        return compile_record(graph, inputs) if compile else graph.forward
+    def others(_: None, obs: Tensor, *state: Tensor) -> list[tuple[Any, ...]]:
+        return [(None, _other(obs, draw), *state) for draw in range(3)]
+
+    mode = "record" if mode == "off" else mode
+    native = compiled(act, watch={"the actor": actor}, others=others, mode=mode, name="the policy")
+    with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
+        return native.bind(None, obs, *remembered.values())
 
 
-class _LeavesTorch(TorchFunctionMode):
-    """Notices tensors that become numpy arrays or lists: what is computed from those is a constant of a record."""
-
-    seen = False
-
-    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        self.seen |= func in (Tensor.numpy, Tensor.tolist, Tensor.__array__)
-        return func(*args, **(kwargs or {}))
-
-
-def _repeats(graph: Act, act: Act, inputs: Sequence[Tensor]) -> bool:
-    """Whether a recorded policy does on other observations what the policy does; Python's numbers are constants."""
-    obs, *state = inputs
-    for _ in range(3):
-        other = obs + 0.1 * torch.rand_like(obs)
-        random = torch.get_rng_state()
-        expected = act(other, *state)
-        torch.set_rng_state(random)
-        if not all(torch.allclose(x, y, equal_nan=True) for x, y in zip(graph(other, *state), expected, strict=True)):
-            return False
-    return True
+def _other(obs: Tensor, seed: int) -> Tensor:
+    """Other observations of the same type: noise on numbers, any pixels, flags and integers in another order."""
+    draw = torch.Generator(obs.device).manual_seed(seed)
+    if obs.dtype.is_floating_point:
+        return obs + 0.1 * torch.rand(obs.shape, generator=draw, dtype=obs.dtype, device=obs.device)
+    if obs.dtype is torch.uint8:
+        return torch.randint(256, obs.shape, generator=draw, dtype=obs.dtype, device=obs.device)
+    return obs.flatten()[torch.randperm(obs.numel(), generator=draw, device=obs.device)].view_as(obs)
 
 
 def random_actions(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import torch
 from tensordict import TensorDictBase
@@ -97,7 +97,6 @@ class TorchRLBatches:
             hasattr(getattr(buffer, "sampler", None), "update_priority")
             and "Prioritized" in type(buffer.sampler).__name__
         )
-        self._index = torch.arange(batch_size)
 
     def extend(self, rollout: TensorDictBase) -> None:
         if rollout.batch_dims > 1 and rollout.batch_size[0] > 1 and "MultiStepTransform" in str(self.settings()):
@@ -111,15 +110,16 @@ class TorchRLBatches:
         for _ in range(batches):
             self._sample = self.buffer.sample(self.batch_size)
             data = self._sample.select(*wiring.read_keys(self.loss, self._sample))
-            self._batch = data.set(self.priority, torch.zeros(self.batch_size))
-            yield self._batch, self._index
+            self._batch = data.set(self.priority, torch.zeros(self.batch_size, device=data.device))
+            yield self._batch, torch.arange(self.batch_size, device=data.device)
 
     def gather(self, data: TensorDictBase, index: Tensor) -> TensorDictBase:
-        return data.exclude(self.priority)
+        rows = data.exclude(self.priority)
+        return rows if len(index) == self.batch_size else cast(TensorDictBase, rows[index])
 
     def write_back(self, data: TensorDictBase, index: Tensor, batch: TensorDictBase) -> None:
         if self.prioritized:
-            data[self.priority].copy_(batch[self.priority].flatten())
+            data[self.priority].index_copy_(0, index, batch[self.priority].flatten().to(data[self.priority].dtype))
 
     def written(self) -> list[Tensor]:
         return []

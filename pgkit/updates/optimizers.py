@@ -18,7 +18,7 @@ from torch.optim.adam import adam
 from torch.optim.rmsprop import rmsprop
 from torch.optim.sgd import sgd
 
-from pgkit.compiling import computed_once
+from pgkit.compiled import computed_once
 from pgkit.errors import UserError
 
 Apply = Callable[[list[Tensor]], None]

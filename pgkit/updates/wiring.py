@@ -11,10 +11,10 @@ from tensordict import TensorDictBase
 from torch import nn
 from torch.optim import Optimizer
 
+from pgkit.compiled import undone
 from pgkit.errors import UserError
 from pgkit.updates import entries, owners
 from pgkit.updates.chain import Chain, is_loss
-from pgkit.updates.restoring import undone
 from pgkit.updates.tables import NoTables, TableError
 
 

@@ -5,9 +5,9 @@ from typing import Any
 
 import pytest
 import torch
+from pgkit.constants import Constants
 from torch import nn
 
-from pgkit.constants import Constants
 from pgkit.errors import UserError
 from tests.updates.test_on_policy import make_agent, make_rollout, parameters
 

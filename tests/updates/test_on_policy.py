@@ -1,18 +1,19 @@
+import copy
 from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from pgkit.updates.on_policy import CompiledAdvantage
 from tensordict import TensorDict
 from torchrl.objectives import ClipPPOLoss as TorchRLClipPPOLoss
 from torchrl.objectives.value import GAE as TorchRLGAE
 
 from pgkit import advantages, controllers, envs, losses, modules, updates
-from pgkit.compiling import record
+from pgkit.compiled.native import record
 from pgkit.errors import UserError
 from pgkit.updates import optimizers
-from pgkit.updates.recorded import recorded_block
 
 
 def make_agent(seed=0, dtype=torch.float32, loss_class=losses.ClipPPOLoss, optimizer=torch.optim.Adam, **kwargs):
@@ -89,32 +90,52 @@ def test_several_optimizers_together_are_part_of_the_step(mode, monkeypatch):
         torch.testing.assert_close(parameters(update), parameters(twin), rtol=1e-4, atol=1e-5)
 
 
-def test_a_recorded_advantage_follows_weights_and_settings_and_leaves_other_layouts_to_the_block():
+def test_a_compiled_advantage_follows_weights_settings_and_layouts():
     update = make_agent(compile="on", epochs=1, minibatch_size=None)
     update(make_rollout())
     block: Any = update.advantage
-    assert update._estimate is not None and update._estimate is not block
+    assert update._plan is not None
+    estimate = update._plan.estimate
+    assert isinstance(estimate, CompiledAdvantage) and estimate.native.rung == "recorded and compiled"
     other = make_rollout(3, rows=(64, 2)).transpose(0, 1)  # the same shape, other strides
     for rollout in (make_rollout(1), make_rollout(2), other):
         with torch.no_grad():
             for parameter in block.critic.parameters():
                 parameter.add_(0.1)
         block.gamma.mul_(0.9)
-        expected, got = block(rollout.clone()), update._estimate(rollout.clone(recurse=False))
+        expected, got = block(rollout.clone()), estimate(rollout.clone(recurse=False))
         for key in block.out_keys:
             torch.testing.assert_close(got[key], expected[key])
 
 
-def test_an_advantage_that_changes_its_buffers_is_not_recorded():
+def test_an_advantage_that_changes_its_buffers_keeps_doing_so():
     class Counting(advantages.GAE):
         def estimate(self, value, next_value, rollout):
             self.gamma.mul_(0.9)
             return super().estimate(value, next_value, rollout)
 
     block = Counting(modules.state_value(envs.make("Pendulum-v1")))
-    with pytest.raises(RuntimeError, match="changes a buffer"):
-        recorded_block(block, make_rollout())
-    assert block.gamma == torch.tensor(0.99)
+    estimate, twin = CompiledAdvantage(block, "on"), copy.deepcopy(block)
+    for i in range(3):
+        expected, got = twin(make_rollout(i)), estimate(make_rollout(i))
+        torch.testing.assert_close(got["advantage"], expected["advantage"])
+        torch.testing.assert_close(block.gamma, twin.gamma)
+
+
+def test_a_block_that_is_too_long_to_compile_is_recorded_or_refused(caplog):
+    class Loop(advantages.GAE):
+        def estimate(self, value, next_value, rollout):
+            total = torch.zeros_like(value[..., 0, :])
+            for t in range(value.shape[-2]):
+                total = total * self.gamma + value[..., t, :] * next_value[..., t, :]
+            return super().estimate(value + total.unsqueeze(-2), next_value, rollout)
+
+    block = Loop(modules.state_value(envs.make("Pendulum-v1")))
+    estimate = CompiledAdvantage(block, "auto")
+    torch.testing.assert_close(estimate(make_rollout())["advantage"], block(make_rollout())["advantage"])
+    assert estimate.native.rung == "recorded, not compiled" and "too many to compile soon" in caplog.text
+    with pytest.raises(UserError, match="the advantage block cannot be compiled .*too many to compile soon"):
+        CompiledAdvantage(block, "on")(make_rollout())
 
 
 def test_compiled_step_follows_normalizers_coefficients_and_learning_rate():

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from pgkit.compiling import compile_record, record
+from pgkit.compiled.native import compile_record, record
 from tests.updates.test_on_policy import make_agent, make_rollout, parameters
 
 
