@@ -95,7 +95,10 @@ def _inside(path: str, read: Callable[[], Any]) -> Iterator[Slot]:
 
 
 def _content(cell: CellType) -> Any:
-    return cell.cell_contents
+    try:
+        return cell.cell_contents
+    except ValueError:  # it is empty yet
+        return None
 
 
 def _item(read: Callable[[], Any], key: Any) -> Any:
