@@ -52,7 +52,8 @@ def trace(
 ) -> Act:
     """A function from observations of the shape of ``obs`` to the tensors at :func:`output_keys`.
 
-    A recurrent actor's function takes the entries of :func:`memory` too. ``split`` makes entries of ``obs``.
+    It is :func:`policy`, bound. A recurrent actor's function takes the entries of :func:`memory` too. ``split`` makes
+    entries of ``obs``.
 
     It is the actor's own sequence of tensor operations, recorded once and called without TensorDict: the same numbers
     bit for bit, at about a quarter of the cost for a small network. Compiled, it halves that again and rounds
@@ -63,6 +64,18 @@ def trace(
     Args:
         mode: of :func:`pgkit.compiled.compiled`; ``off`` records all the same, which changes no bit.
     """
+    with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
+        native, *inputs = policy(actor, obs, mode, split)
+        return native.bind(None, *inputs)
+
+
+def policy(
+    actor: TensorDictModuleBase,
+    obs: Tensor,
+    mode: Mode = "off",
+    split: Callable[[Tensor], dict[str, Tensor]] = whole,
+) -> tuple[Any, ...]:
+    """The actor behind the door to native code, and the inputs to bind it to: ``(compiled, obs, *memory)``."""
     keys = output_keys(actor)
     remembered = memory(actor, len(obs))
 
@@ -76,8 +89,7 @@ def trace(
 
     mode = "record" if mode == "off" else mode
     native = compiled(act, watch={"the actor": actor}, others=others, mode=mode, name="the policy")
-    with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
-        return native.bind(None, obs, *remembered.values())
+    return native, obs, *remembered.values()
 
 
 def _other(obs: Tensor, seed: int) -> Tensor:

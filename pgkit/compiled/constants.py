@@ -5,7 +5,7 @@ from __future__ import annotations
 import operator
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
-from types import CellType, FunctionType, MethodType
+from types import FunctionType, MethodType
 from typing import Any
 
 from tensordict import TensorDictBase
@@ -77,45 +77,36 @@ def _of_module(path: str, module: nn.Module, seen: set[int]) -> Iterator[Slot]:
 
 def _inside(path: str, read: Callable[[], Any]) -> Iterator[Slot]:
     """What an attribute that is no module holds."""
-    value = read()
-    if isinstance(value, partial):
-        yield from _inside(path, lambda: value.func)
-    elif isinstance(value, MethodType) and not isinstance(value.__self__, nn.Module):
-        yield from _inside(path, lambda: value.__self__)
-    elif isinstance(value, FunctionType):
+    value, keys = read(), list[Any]()
+    while isinstance(value, partial | MethodType):
+        value = value.func if isinstance(value, partial) else value.__self__
+        read = partial(lambda held: held, value)
+    if isinstance(value, FunctionType):
         cells = zip(value.__code__.co_freevars, value.__closure__ or (), strict=True)
-        yield from ((f"{path}.{name}", partial(_content, cell)) for name, cell in cells)
+        yield from ((f"{path}.{name}", partial(_held, lambda cell=cell: cell, "cell_contents")) for name, cell in cells)
         numbers = [key for key in value.__code__.co_names if isinstance(value.__globals__.get(key), int | float)]
         yield from ((f"{path}: {key}", partial(value.__globals__.get, key)) for key in numbers)
-    elif isinstance(value, dict | list | tuple):
-        keys = value if isinstance(value, dict) else range(min(len(value), _MOST_ITEMS))
-        yield from ((f"{path}.{key}", partial(_item, read, key)) for key in keys)
-    elif not isinstance(value, type | Tensor | TensorDictBase | nn.Module) and hasattr(value, "__dict__"):
-        yield from ((f"{path}.{key}", partial(_attribute, read, key)) for key in _public(value, vars(value)))
+    elif isinstance(value, dict):
+        keys = list(value)
+    elif isinstance(value, list | tuple):
+        keys = list(range(min(len(value), _MOST_ITEMS)))
+    elif not isinstance(value, type | Tensor | TensorDictBase | nn.Module):
+        keys = _public(value, getattr(value, "__dict__", {}))
+    yield from ((f"{path}.{key}", partial(_held, read, key)) for key in keys)
 
 
-def _content(cell: CellType) -> Any:
+def _held(read: Callable[[], Any], key: Any) -> Any:
+    """An item or attribute of what is there now, None if it has none."""
+    value = read()
     try:
-        return cell.cell_contents
-    except ValueError:  # it is empty yet
+        return value[key] if isinstance(value, dict | list | tuple) else getattr(value, key, None)
+    except (LookupError, TypeError, ValueError):
         return None
-
-
-def _item(read: Callable[[], Any], key: Any) -> Any:
-    try:
-        return read()[key]
-    except (LookupError, TypeError):
-        return None
-
-
-def _attribute(read: Callable[[], Any], key: str) -> Any:
-    return getattr(read(), key, None)
 
 
 def _public(owner: Any, attributes: Mapping[str, Any]) -> list[str]:
-    if type(owner).__module__.split(".")[0] in _LIBRARIES:
-        return [key for key in attributes if not key.startswith("_")]
-    return [key for key in attributes if key not in _INTERNAL]
+    own = type(owner).__module__.split(".")[0] not in _LIBRARIES
+    return [key for key in attributes if (key not in _INTERNAL if own else not key.startswith("_"))]
 
 
 def _same(old: Any, new: Any) -> bool:

@@ -6,6 +6,7 @@ import shutil
 import time
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from logging import INFO, WARNING, getLogger
 from typing import Any, Literal, cast
@@ -15,7 +16,7 @@ from torch import Tensor
 
 from pgkit.compiled.constants import Constants, tensors_of
 from pgkit.compiled.native import compile_record, torch_compiled
-from pgkit.compiled.recorded import Bind, Function, Task, recorded
+from pgkit.compiled.recorded import Bind, Function, Recorder, recorded
 from pgkit.compiled.trial import check_repeats
 from pgkit.errors import UserError
 
@@ -25,7 +26,6 @@ _LADDERS: dict[str, tuple[str, ...]] = {
     "on": (RECORDED, TRACED),
     "auto": (RECORDED, TRACED, REPLAYED, EAGER),
     "record": (REPLAYED, EAGER),
-    "off": (EAGER,),
 }
 _MOST_LAYOUTS = 4  # that are compiled for
 
@@ -51,17 +51,9 @@ def choose(compile: str, calls: float | None, least_calls: float) -> Mode:
     return "off" if compile == "auto" and calls is not None and calls < least_calls else cast(Mode, compile)
 
 
-def compiled(
-    function: Function,
-    *,
-    watch: Mapping[str, Any],
-    holds: Iterable[Tensor] = (),
-    others: Callable[..., Iterable[Sequence[Any]]],
-    mode: Mode,
-    name: str,
-    most: int | None = None,
-) -> Compiled:
-    """``function(data, *inputs) -> [tensor, ...]`` as native code; ``compiled(...).bind(data, *inputs)`` is its call.
+@dataclass
+class Compiled:
+    """``compiled(function, ...).bind(data, *inputs)`` is ``function(data, *inputs) -> [tensor, ...]`` as native code.
 
     What the function closes over is a constant, as in JAX. Noticed, with a warning and new code at the next ``bind``,
     is a change of the parameters, buffers and attributes of the modules in ``watch``, and of what a callable that one
@@ -72,42 +64,31 @@ def compiled(
             held, in place, and entries of ``data``; with ``torch.no_grad`` or without as it says itself.
         watch: modules (or functions) that it uses, by what a message calls them: ``{"the loss": loss}``. Their
             parameters and buffers are held.
-        holds: further tensors that it changes or that change in place: optimizer state, priorities, a cache.
         others: ``(data, *inputs) -> [(data, *inputs), ...]``, more inputs of the same layout, on which native code has
-            to repeat the function; other rows, or random ones for numbers that may be any.
+            to repeat the function: other rows, or random ones for numbers that may be any.
         mode: ``on``: recorded and compiled, else by ``torch.compile``, else a ``UserError``. ``auto``: besides these
             recorded without a compiler, else as it is. ``record``: recorded without a compiler (the same bits), else as
             it is. ``off``: as it is.
         name: what the log calls it: ``the update``.
+        holds: further tensors that it changes or that change in place: optimizer state, priorities, a cache.
         most: operations that are worth compiling, of a function that may be a long loop; it skips ``torch.compile``.
-    """
-    return Compiled(function, watch, list(holds), others, mode, name, most)
-
-
-class Compiled:
-    """What :func:`compiled` returns.
 
     Attributes:
-        function: the function as it is, for inputs that are not worth compiling.
         seconds: spent recording and compiling so far.
         rung: how it runs: ``recorded and compiled``, ``torch.compile``, ``recorded, not compiled`` or ``eager``.
     """
 
-    def __init__(
-        self,
-        function: Function,
-        watch: Mapping[str, Any],
-        holds: Sequence[Tensor],
-        others: Callable[..., Iterable[Sequence[Any]]],
-        mode: Mode,
-        name: str,
-        most: int | None,
-    ) -> None:
-        self.function, self.seconds, self.rung = function, 0.0, EAGER
-        self._watch, self._holds, self._others, self._mode, self._name = watch, holds, others, mode, name
-        self._most, self._ladder = most, [rung for rung in _LADDERS[mode] if most is None or rung != TRACED]
-        self._built: dict[Any, Bind] = {}
-        self._constants: Constants | None = None
+    function: Function
+    watch: Mapping[str, Any]
+    others: Callable[..., Iterable[Sequence[Any]]]
+    mode: Mode
+    name: str
+    holds: Sequence[Tensor] = ()
+    most: int | None = None
+    seconds: float = field(default=0.0, init=False)
+    rung: str = field(default=EAGER, init=False)
+    _built: dict[Any, Bind] = field(default_factory=dict, init=False)
+    _constants: Constants | None = field(default=None, init=False)
 
     def bind(self, data: TensorDictBase | None, *inputs: Tensor) -> Function:
         """``call(*inputs) -> [tensor, ...]`` on this data, for inputs laid out like these.
@@ -116,14 +97,12 @@ class Compiled:
         noticed; a call checks nothing. The first bind of a layout records and compiles, up to 40 seconds; the function
         runs for that, which is undone. The results of a call stay what they are at the next one.
         """
-        if self._mode == "off":
+        if self.mode == "off":
             return partial(self.function, data)
-        changed = None if self._constants is None else self._constants.changed()
-        if changed:
-            getLogger("pgkit").warning(
-                "%s is compiled again: %s (what changes in place, by fill_, needs no such thing)", self._name, changed
-            )
-            self._built, self._constants = {}, None
+        if self._constants and (changed := self._constants.changed()):
+            advice = "what changes in place, by fill_, needs no such thing"
+            getLogger("pgkit").warning("%s is compiled again: %s (%s)", self.name, changed, advice)
+            self._built.clear()
         layout = _layout(data, inputs)
         if layout not in self._built:
             if len(self._built) >= _MOST_LAYOUTS:
@@ -135,73 +114,77 @@ class Compiled:
 
     def _build(self, data: TensorDictBase | None, inputs: Sequence[Tensor]) -> Bind:
         """The first rung of the ladder that bears."""
-        if self._mode != "record":
-            getLogger("pgkit").info("compiling %s, once: up to 40 seconds, less when it is in the cache", self._name)
-        held = list({id(x): x for x in (*tensors_of(self._watch), *self._holds)}.values())
-        others = list(self._others(data, *inputs))
+        if self.mode != "record":
+            getLogger("pgkit").info("compiling %s, once: up to 40 seconds, less when it is in the cache", self.name)
         failed: list[str] = []
-        bind: Bind = lambda data: partial(self.function, data)  # noqa: E731
-        for rung in self._ladder:
+        for rung in _LADDERS[self.mode]:
+            if rung == TRACED and self.most is not None:
+                continue
+            self.rung = rung
             try:
-                bind = self._climb(rung, Task(self.function, held, data, inputs, others))
-                break
+                bind = self._climb(data, inputs)
+                self._say(failed)
+                return bind
             except UserError:
                 raise
-            except Exception as error:  # compilers and a torch whose private parts have moved raise anything
-                failed.append(f"{rung}: {_first_line(error)}")
+            except Exception as error:  # compilers, and a torch whose private parts have moved, raise anything
+                failed.append(f"{rung}: {str(error).strip().partition(chr(10))[0] or type(error).__name__}")
                 last = error
-        else:
-            raise UserError(
-                f"{self._name} cannot be compiled ({'; '.join(failed)}): compile='auto' runs it without, compile='off' "
-                "does not try"
-            ) from last
-        self.rung = rung
-        self._say(rung, failed)
-        return bind
+        raise UserError(
+            f"{self.name} cannot be compiled ({'; '.join(failed)}): compile='auto' runs it without, compile='off' does "
+            "not try"
+        ) from last
 
-    def _climb(self, rung: str, task: Task) -> Bind:
-        if rung == EAGER:
-            self._constants = None
+    def _climb(self, data: TensorDictBase | None, inputs: Sequence[Tensor]) -> Bind:
+        """The function as the present rung runs it, which must repeat it on the other inputs."""
+        self._constants = None
+        if self.rung == EAGER:
             return lambda data: partial(self.function, data)
-        self._constants = constants = Constants(self._watch)
+        held = list({id(x): x for x in (*tensors_of(self.watch), *self.holds)}.values())
+        others = list(self.others(data, *inputs))
+        constants = Constants(self.watch)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the compiler's, on tensordict's and TorchRL's code
-            if rung == TRACED:
+            if self.rung == TRACED:
                 traced = torch_compiled(self.function)
-                check_repeats(traced, self.function, task.held, [(task.data, *task.inputs), *task.others])
+                check_repeats(traced, self.function, held, [(data, *inputs), *others])
                 bind: Bind = lambda data: partial(traced, data)  # noqa: E731
             else:
-                bind = recorded(task, self._compile if rung == RECORDED else lambda graph, _: graph.forward)
+                known = {id(tensor) for tensor in held}
+                keys = [] if data is None else [key for key in data.keys(True, True) if id(data[key]) not in known]
+                bind = recorded(Recorder(self.function, held, keys, self._compile), data, inputs, others)
         if changed := constants.changed():
             raise RuntimeError(
                 f"it changes a number of its own as it runs, which is no part of a graph: {changed} (hold a tensor)"
             )
+        self._constants = constants
         return bind
 
     def _compile(self, graph: Any, inputs: Sequence[Tensor]) -> Callable[..., Any]:
-        if self._most is not None and len(graph.graph.nodes) > self._most:
+        if self.rung == REPLAYED:
+            return graph.forward
+        if self.most is not None and len(graph.graph.nodes) > self.most:
             raise RuntimeError(f"it is {len(graph.graph.nodes)} operations, too many to compile soon")
         return compile_record(graph, inputs)
 
-    def _say(self, rung: str, failed: Sequence[str]) -> None:
-        slow = self._mode != "record" and rung in (REPLAYED, EAGER)
-        words = f"runs {rung}"
-        if rung == EAGER:
+    def _say(self, failed: Sequence[str]) -> None:
+        slow = self.mode == "auto" and self.rung in (REPLAYED, EAGER)
+        words = f"runs {self.rung}"
+        if self.rung == EAGER:
             words = f"cannot be {'compiled' if slow else 'recorded'} and runs without, several times slower"
         why = f" ({'; '.join(failed)})" if failed else ""
         advice = "; compile='on' stops here, compile='off' is silent" if slow else ""
-        getLogger("pgkit").log(WARNING if slow else INFO, "%s %s%s%s", self._name, words, why, advice)
+        getLogger("pgkit").log(WARNING if slow else INFO, "%s %s%s%s", self.name, words, why, advice)
+
+
+compiled = Compiled  # reads as what it does: ``compiled(function, ...)``
 
 
 def _layout(data: TensorDictBase | None, inputs: Sequence[Tensor]) -> Any:
     leaves = [] if data is None else [(key, data[key]) for key in data.keys(True, True)]
-    return tuple((key, *_laid_out(x)) for key, x in leaves), tuple(_laid_out(x) for x in inputs)
+    return tuple((key, *_laid_out(x)) for key, x in leaves), tuple(map(_laid_out, inputs))
 
 
 def _laid_out(x: Tensor) -> Any:
     strides = tuple(stride for size, stride in zip(x.shape, x.stride(), strict=True) if size > 1)
     return x.shape, strides, x.dtype, x.device
-
-
-def _first_line(error: Exception) -> str:
-    return f"{error}".strip().partition("\n")[0] or type(error).__name__

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 from logging import getLogger
 from typing import Any
 
@@ -24,134 +25,109 @@ _MOST_GRAPHS = 3  # of one function, for different decisions: each takes seconds
 
 
 @dataclass(frozen=True)
-class Task:
-    """What is to become native code.
+class Recorder:
+    """Makes graphs of a function.
 
     Args:
         function: ``(data, *inputs) -> tensors``; changes tensors of ``held`` in place, and entries of ``data``.
         held: parameters, buffers, optimizer state and the like, each once.
-        data: an example, or None for a function without.
-        inputs: further examples.
-        others: more of ``(data, *inputs)``, on which native code must repeat the function.
+        keys: the entries of the data, but for those that are held (a replay's priorities are both).
+        compile: ``(graph, inputs) -> code``.
     """
 
     function: Function
     held: Sequence[Tensor]
-    data: TensorDictBase | None
-    inputs: Sequence[Tensor]
-    others: Sequence[Sequence[Any]]
-
-    @property
-    def leaves(self) -> Leaves:
-        """What reads the entries of data like this; not those that are held (a replay's priorities are both)."""
-        known, data = {id(tensor) for tensor in self.held}, self.data
-        return Leaves([] if data is None else [key for key in data.keys(True, True) if id(data[key]) not in known])
-
-
-@dataclass(frozen=True)
-class Leaves:
-    """Tensors of a TensorDict in a fixed order."""
-
     keys: Sequence[Any]
+    compile: Callable[..., Any]
 
-    def __call__(self, data: TensorDictBase | None) -> list[Tensor]:
+    def leaves(self, data: TensorDictBase | None) -> list[Tensor]:
+        """The tensors of data."""
         return [] if data is None else [data[key] for key in self.keys]
 
+    def graph(
+        self, data: TensorDictBase | None, inputs: Sequence[Tensor]
+    ) -> tuple[Callable[..., list[Tensor] | None], Decisions]:
+        """The function of ``(*leaves, *inputs)`` in native code, and its decisions: it gives None where they differ."""
+        held, leaves, decisions = self.held, self.leaves(data), Decisions()
 
-def recorded(task: Task, compile: Callable[..., Any]) -> Bind:
-    """``bind(data) -> call``, for data and inputs laid out as the task's.
+        def flat(*tensors: Tensor) -> list[Tensor]:
+            given, rest = tensors[: len(held)], tensors[len(held) :]
+            rows = None if data is None else data.copy()  # of nested TensorDicts too: ``data`` stays as it is
+            for key, leaf in zip(self.keys, rest, strict=False):
+                rows.set(key, leaf)
+            before = [tensor.detach().clone() for tensor in given]
+            with decisions:
+                results = self.function(rows, *rest[len(leaves) :])
+            if not decisions:
+                return list(results)
+            as_recorded = decisions.hold()
+            with torch.no_grad():
+                for tensor, value in zip(given, before, strict=True):
+                    tensor.copy_(torch.where(as_recorded, tensor, value))
+            return [as_recorded, *results]
+
+        graph = undone(held, lambda: record(flat, [*held, *leaves, *inputs]))
+        _check_constants(graph, held)
+        fixed = [tensor.detach() for tensor in held]
+        code = self.compile(graph, [*fixed, *leaves, *inputs])
+
+        def run(*tensors: Tensor) -> list[Tensor] | None:
+            with torch.no_grad():
+                results = code(*fixed, *tensors)
+            return results if not decisions else results[1:] if results[0] else None
+
+        return run, decisions
+
+
+def recorded(
+    recorder: Recorder, data: TensorDictBase | None, inputs: Sequence[Tensor], others: Sequence[Sequence[Any]]
+) -> Bind:
+    """``bind(data) -> call``, for data and inputs laid out like these.
 
     A function that decides something on tensors' values (``if kl > bound``) gets a graph for the decisions that it
     takes here; the graph tests them and changes nothing where one comes out otherwise. Up to three sets of decisions
     are recorded, as they occur; others run the function itself. The recording runs the function, which is undone.
 
-    Args:
-        task: what to record.
-        compile: ``(graph, inputs) -> code``.
-
     Raises:
         RuntimeError: the function reads a number that is another for other inputs, works on a tensor that shares memory
-            with one of ``held`` without being it, or the record does not repeat it.
+            with one of the held without being it, or the record does not repeat it on ``others``.
     """
-    graph, decisions = _graph(task, compile)
-    leaves_of = task.leaves
+    graph, decisions = recorder.graph(data, inputs)
 
     def first(data: TensorDictBase | None, *inputs: Tensor) -> Sequence[Tensor] | None:
-        out = graph(*leaves_of(data), *inputs)
+        out = graph(*recorder.leaves(data), *inputs)
         if out is None and decisions.numbers:
             raise RuntimeError("it reads a number off a tensor, and it is another for other inputs")
         return out
 
-    check_repeats(first, task.function, task.held, task.others)
-    if decisions:
-        return _by_decisions(task, compile, graph)
-    if all(x.device.type == "cuda" for x in (*task.held, *leaves_of(task.data), *task.inputs)):
-        return captured(graph, leaves_of, task.held, task.inputs)
+    check_repeats(first, recorder.function, recorder.held, others)
+    if not decisions and all(x.is_cuda for x in (*recorder.held, *recorder.leaves(data), *inputs)):
+        return captured(graph, recorder.leaves, recorder.held, inputs)
+    graphs = [graph]
 
     def bind(data: TensorDictBase | None) -> Function:
-        leaves = leaves_of(data)
-        return lambda *inputs: graph(*leaves, *inputs)
-
-    return bind
-
-
-def _by_decisions(task: Task, compile: Callable[..., Any], first: Callable[..., Any]) -> Bind:
-    """Calls the graph whose decisions come out as recorded, and makes new ones as they occur."""
-    graphs, leaves_of = [first], task.leaves
-
-    def bind(data: TensorDictBase | None) -> Function:
-        leaves = leaves_of(data)
-
-        def call(*inputs: Tensor) -> Sequence[Tensor]:
-            random = torch.get_rng_state()
-            for position, graph in enumerate(graphs):
-                result = graph(*leaves, *inputs)
-                if result is not None:
-                    graphs.insert(0, graphs.pop(position))
-                    return result
-                torch.set_rng_state(random)
-            if len(graphs) < _MOST_GRAPHS:
-                getLogger("pgkit").info("compiling for another branch of the loss, once: a few seconds")
-                graphs.insert(0, _graph(replace(task, data=data, inputs=inputs), compile)[0])
-            return task.function(data, *inputs)
-
-        return call
-
-    return bind
-
-
-def _graph(task: Task, compile: Callable[..., Any]) -> tuple[Callable[..., list[Tensor] | None], Decisions]:
-    """The function of ``(*leaves, *inputs)`` as one graph, and its decisions: it gives None where they are others."""
-    held, decisions = task.held, Decisions()
-    keys, leaves = task.leaves.keys, task.leaves(task.data)
-
-    def flat(*tensors: Tensor) -> list[Tensor]:
-        given, rest = tensors[: len(held)], tensors[len(held) :]
-        rows = None if task.data is None else task.data.copy()  # of nested TensorDicts too: ``data`` stays as it is
-        for key, leaf in zip(keys, rest, strict=False):
-            rows.set(key, leaf)
-        before = [tensor.detach().clone() for tensor in given]
-        with decisions:
-            results = task.function(rows, *rest[len(keys) :])
         if not decisions:
-            return list(results)
-        as_recorded = decisions.hold()
-        with torch.no_grad():
-            for tensor, value in zip(given, before, strict=True):
-                tensor.copy_(torch.where(as_recorded, tensor, value))
-        return [as_recorded, *results]
+            return partial(graph, *recorder.leaves(data))
+        return partial(_by_decisions, recorder, graphs, data)
 
-    graph = undone(held, lambda: record(flat, [*held, *leaves, *task.inputs]))
-    _check_constants(graph, held)
-    fixed = [tensor.detach() for tensor in held]
-    code = compile(graph, [*fixed, *leaves, *task.inputs])
+    return bind
 
-    def run(*tensors: Tensor) -> list[Tensor] | None:
-        with torch.no_grad():
-            results = code(*fixed, *tensors)
-        return results if not decisions else results[1:] if results[0] else None
 
-    return run, decisions
+def _by_decisions(
+    recorder: Recorder, graphs: list[Callable[..., Any]], data: TensorDictBase | None, *inputs: Tensor
+) -> Sequence[Tensor]:
+    """The result of the graph whose decisions come out as recorded; a new one where none does."""
+    random = torch.get_rng_state()
+    for position, graph in enumerate(graphs):
+        result = graph(*recorder.leaves(data), *inputs)
+        if result is not None:
+            graphs.insert(0, graphs.pop(position))
+            return result
+        torch.set_rng_state(random)
+    if len(graphs) < _MOST_GRAPHS:
+        getLogger("pgkit").info("compiling for another branch of the loss, once: a few seconds")
+        graphs.insert(0, recorder.graph(data, inputs)[0])
+    return recorder.function(data, *inputs)
 
 
 def _check_constants(graph: GraphModule, held: Sequence[Tensor]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from typing import Any
 
 import torch
@@ -34,26 +35,21 @@ def check_repeats(
         RuntimeError: they differ, by more than rounding, or ``native`` does not write where the function does.
     """
 
-    def traced(run: Callable[..., Any], arguments: Sequence[Any]) -> tuple[Any, list[bool]]:
-        before = [tensor.detach().clone() for tensor in held]
-        result = run(*arguments)
-        return result, [not torch.equal(x, old) for x, old in zip(held, before, strict=True)]
-
     for arguments in others:
-        (expected, written), (got, kept) = (
-            undone(held, lambda run=run, arguments=arguments: traced(run, arguments)) for run in (function, native)
+        (expected, changed), (got, kept) = (
+            undone(held, partial(_traced, f, held, arguments)) for f in (function, native)
         )
         if got is None:
             continue
         for mine, its in zip(got, expected, strict=True):
-            if not _close(mine, its):
+            same = mine.shape == its.shape and mine.dtype == its.dtype
+            if not (same and torch.isclose(mine, its, rtol=1e-3, atol=1e-4, equal_nan=True).all()):
                 raise RuntimeError(f"it differs on other inputs: {mine} is not {its}")
-        lost = [tuple(x.shape) for x, one, other in zip(held, written, kept, strict=True) if one and not other]
-        if lost:
+        if lost := [tuple(x.shape) for x, one, other in zip(held, changed, kept, strict=True) if one and not other]:
             raise RuntimeError(f"it loses what the function writes to a tensor of shape {lost[0]}")
 
 
-def _close(x: Tensor, y: Tensor) -> bool:
-    if x.shape != y.shape or x.dtype != y.dtype:
-        return False
-    return bool(torch.isclose(x, y, rtol=1e-3, atol=1e-4, equal_nan=True).all())
+def _traced(function: Callable[..., Any], held: Sequence[Tensor], arguments: Sequence[Any]) -> tuple[Any, list[bool]]:
+    """The function's result, and which of the held tensors it changed."""
+    before = [tensor.detach().clone() for tensor in held]
+    return function(*arguments), [not torch.equal(x, old) for x, old in zip(held, before, strict=True)]

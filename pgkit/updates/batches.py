@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any, Protocol, cast
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDictBase
@@ -16,40 +16,13 @@ from pgkit.updates import wiring
 Draw = tuple[TensorDictBase, Tensor]
 
 
-class Batches(Protocol):
-    """A source of batches for :class:`~pgkit.updates.GradientStep`."""
-
-    def extend(self, rollout: TensorDictBase) -> None:
-        """Stores a rollout."""
-        ...
-
-    def draw(self, batches: int) -> Iterator[Draw]:
-        """Pairs ``(data, index)``, one a gradient step."""
-        ...
-
-    def gather(self, data: TensorDictBase, index: Tensor) -> TensorDictBase:
-        """The batch of a pair, in the graph."""
-        ...
-
-    def write_back(self, data: TensorDictBase, index: Tensor, batch: TensorDictBase) -> None:
-        """The batch's priorities to where they belong, in the graph."""
-        ...
-
-    def written(self) -> list[Tensor]:
-        """What :meth:`write_back` changes, besides ``data``."""
-        ...
-
-    def drawn(self) -> None:
-        """Called after each step, outside the graph."""
-        ...
-
-    def settings(self) -> dict[str, Any]:
-        """Objects with a ``gamma`` of their own, by name."""
-        ...
-
-
 class OwnBatches:
-    """From pgkit's replay: only row numbers are drawn, the rest is in the graph."""
+    """From pgkit's replay: only row numbers are drawn, the rest is in the graph.
+
+    :meth:`extend` stores a rollout; :meth:`draw` gives a pair ``(data, index)`` a step, :meth:`gather` the batch of a
+    pair and :meth:`write_back` takes its priorities, both in the graph; :meth:`written` is what that changes besides
+    the data; :meth:`drawn` follows each step, outside the graph; :meth:`settings` has the owners of a ``gamma``.
+    """
 
     def __init__(self, buffer: ReplayBuffer, loss: nn.Module, batch_size: int) -> None:
         self.buffer, self.loss, self.batch_size = buffer, loss, batch_size
@@ -88,7 +61,10 @@ class OwnBatches:
 
 
 class TorchRLBatches:
-    """From a TorchRL replay buffer: its ``sample()`` is called for every step, ``td_error`` is written back to it."""
+    """From a TorchRL replay buffer: its ``sample()`` is called for every step, ``td_error`` is written back to it.
+
+    The methods are those of :class:`OwnBatches`.
+    """
 
     def __init__(self, buffer: Any, loss: nn.Module, batch_size: int) -> None:
         self.buffer, self.loss, self.batch_size = buffer, loss, batch_size
@@ -131,6 +107,9 @@ class TorchRLBatches:
     def settings(self) -> dict[str, Any]:
         transforms = getattr(self.buffer, "_transform", None)
         return {f"{type(t).__name__} of {type(self.buffer).__name__}": t for t in transforms or ()}
+
+
+Batches = OwnBatches | TorchRLBatches
 
 
 def priority_key(loss: nn.Module) -> Any:

@@ -212,7 +212,7 @@ class OffPolicyUpdate:
             self.optimizer,
             names,
             params=params,
-            watch={"the loss": self.loss} | ({} if self.augment is None else {"the augmentation": self.augment}),
+            watch={"the loss": self.loss, "the augmentation": self.augment},
             holds=self._batches.written(),
             max_grad_norm=self.max_grad_norm,
             average=self._average if average else None,

@@ -16,7 +16,7 @@ from torch.optim import Optimizer
 from pgkit.compiled import Compiled, Mode, check_compile, choose, compiled
 from pgkit.errors import UserError, whole, within
 from pgkit.functional import standardize
-from pgkit.seams import Advantage, Augmentation
+from pgkit.seams import Augmentation
 from pgkit.updates import wiring
 from pgkit.updates.chain import Chain
 from pgkit.updates.diagram import diagram
@@ -34,21 +34,24 @@ class Plan:
     """What the first rollout settles.
 
     Args:
-        estimate: the advantage block, compiled where that is worth it.
+        block: the advantage block in native code, where that is worth it.
         keys: entries of a rollout that the loss reads.
         anchors: of these, the ones that keep their value from before the first epoch when the advantage is estimated
             again: what losses measure a change from.
         step: on a minibatch.
         batch: an example.
-        native: what is compiled.
     """
 
-    estimate: Advantage | None
+    block: CompiledAdvantage | None
     keys: Sequence[Any]
     anchors: Sequence[Any]
     step: GradientStep
     batch: TensorDictBase
-    native: Sequence[Compiled]
+
+    @property
+    def native(self) -> list[Compiled]:
+        """What is compiled."""
+        return [*self.step.native, *([self.block.native] if self.block else [])]
 
 
 class OnPolicyUpdate:
@@ -179,15 +182,15 @@ class OnPolicyUpdate:
 
     def _rows(self, plan: Plan, rollout: TensorDictBase) -> TensorDictBase:
         """The advantage, then the entries that the loss reads as ``[rows, ...]``."""
-        return as_rows(estimated(self.loss, plan.estimate, rollout).select(*plan.keys), self.sequence_length)
+        rollout = estimated(self.loss, plan.block or self.advantage, rollout)
+        return as_rows(rollout.select(*plan.keys), self.sequence_length)
 
     def _assemble(self, rollout: TensorDictBase) -> tuple[Plan, TensorDictBase]:
         """The plan, and the rollout's rows."""
         if self.advantage is not None:
             check_time(rollout)
         block = self._compiled_advantage(rollout)
-        estimate = self.advantage if block is None else block
-        rollout = estimated(self.loss, estimate, rollout)
+        rollout = estimated(self.loss, block or self.advantage, rollout)
         keys = wiring.read_keys(self.loss, rollout)
         flat = as_rows(rollout.select(*keys), self.sequence_length)
         batch = flat[: self._size(flat)]
@@ -199,8 +202,7 @@ class OnPolicyUpdate:
         chain = Chain(self.loss, None)
         anchors = [key for key in (*chain.keys("value"), *chain.keys("sample_log_prob")) if key in keys]
         step = self._gradient_step(names, flat.numel(), self.epochs * -(-len(flat) // len(batch)))
-        native = [*step.native, *([] if block is None else [block.native])]
-        return Plan(estimate, keys, anchors, step, batch, native), flat
+        return Plan(block, keys, anchors, step, batch), flat
 
     def _gradient_step(self, names: Sequence[str], frames: int, steps: int) -> GradientStep:
         """One step on a minibatch, of so many steps for so many frames."""
@@ -221,7 +223,7 @@ class OnPolicyUpdate:
             gradients,
             self.optimizer,
             names,
-            watch={"the loss": self.loss} | ({} if self.augment is None else {"the augmentation": self.augment}),
+            watch={"the loss": self.loss, "the augmentation": self.augment},
             max_grad_norm=self.max_grad_norm,
             between=self.between,
             apart=self.accumulate > 1,
@@ -268,12 +270,7 @@ class CompiledAdvantage:
 
         self.block = block
         self.native = compiled(
-            entries,
-            watch={"the advantage block": block},
-            others=others,
-            mode=mode,
-            name="the advantage block",
-            most=300,
+            entries, {"the advantage block": block}, others, mode, name="the advantage block", most=300
         )
 
     def __call__(self, rollout: TensorDictBase) -> TensorDictBase:

@@ -8,14 +8,25 @@ import pytest
 import torch
 from torch._subclasses.fake_tensor import DataDependentOutputException, FakeTensorDeviceMismatchError, FakeTensorMode
 
+from pgkit import modules
 from pgkit.updates import GradientStep
-from pgkit.updates.step import grads_of, metrics_of, other_rows
+from pgkit.updates.step import grads_of, metrics_of
 from tests.losses.test_contract import ALGORITHMS, batch, make
+
+BUILDERS = ("gaussian_actor", "deterministic_actor", "tanh_normal_actor", "categorical_actor", "state_value")
+BUILDERS += ("q_value", "discrete_q_value")
+
+
+@pytest.fixture(autouse=True)
+def networks_elsewhere(monkeypatch):
+    for name in BUILDERS:
+        build = getattr(modules, name)
+        monkeypatch.setattr(modules, name, lambda *args, build=build, **kwargs: build(*args, **kwargs).to("meta"))
 
 
 def bare_step(name, spoil=lambda batch: None):
-    """Runs a step as it is recorded, and makes the rows for its trial."""
-    loss, data = make(name).to("meta"), batch(name).to("meta")
+    """Runs a step as it is recorded."""
+    loss, data = make(name), batch(name).to("meta")
     optimizer = torch.optim.Adam([p for p in loss.parameters() if p.requires_grad])
     params = optimizer.param_groups[0]["params"]
     names = [key for key in loss.out_keys if key.startswith("loss_")]

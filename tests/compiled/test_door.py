@@ -5,9 +5,15 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
+from pgkit import envs, modules
+from pgkit.collectors.policy import policy
 from pgkit.compiled import choose, compiled, door, recorded, undone
 from pgkit.compiled.trial import check_repeats
 from pgkit.errors import UserError
+from pgkit.updates import GradientStep
+from pgkit.updates.on_policy import CompiledAdvantage
+from pgkit.updates.step import grads_of, metrics_of
+from tests.updates.test_on_policy import make_agent, make_rollout
 
 
 def rows(seed=0, **entries):
@@ -208,3 +214,56 @@ def test_choice():
     assert choose("auto", 9, 10) == "off" and choose("auto", None, 10) == choose("auto", 10, 10) == "auto"
     with pytest.raises(UserError, match="compile is 'auto', 'on' or 'off', not 'yes'"):
         choose("yes", None, 10)
+
+
+def step_of(mode):
+    update = make_agent(compile=mode, epochs=1)
+    metrics = update(make_rollout())
+    return update._plan.native[0], metrics["loss_objective"]
+
+
+def block_of(mode):
+    update = make_agent(compile=mode, epochs=1, minibatch_size=None)
+    block = CompiledAdvantage(update.advantage, mode)
+    return block.native, float(block(make_rollout())["advantage"].sum())
+
+
+def policy_of(mode):
+    torch.manual_seed(0)
+    env = envs.make("Pendulum-v1", 2)
+    native, obs = policy(modules.gaussian_actor(env), torch.ones(2, 3), mode)
+    torch.manual_seed(1)
+    return native, float(native.bind(None, obs)(obs)[0].sum())
+
+
+@pytest.mark.parametrize("client", [step_of, block_of, policy_of])
+def test_step_block_and_policy_fail_alike(client, monkeypatch, caplog):
+    moved("inductor", TypeError("it has moved"))(monkeypatch)
+    moved("dynamo", AttributeError("it has moved"))(monkeypatch)
+    _, expected = client("off")
+    native, got = client("auto")
+    assert native.rung == "recorded, not compiled" and got == pytest.approx(expected)
+    assert "runs recorded, not compiled (recorded and compiled: it has moved" in caplog.text
+    with pytest.raises(UserError, match="cannot be compiled .*it has moved.*compile='auto' runs it without"):
+        client("on")
+
+
+def test_the_public_step_reads_what_its_data_holds_now():
+    """Also an entry that was replaced in the same TensorDict."""
+    rollout, results = make_rollout().reshape(-1), []
+    for mode in ("off", "record"):
+        agent = make_agent()
+        data, optimizer = agent.advantage(rollout.clone()), agent.optimizer
+        params = optimizer.param_groups[0]["params"]
+
+        def gradients(data, index, loss=agent.loss, params=params):
+            out = loss(data[index])
+            grads = grads_of(out, params)
+            return metrics_of(out, ["loss_objective"], grads[0]), grads
+
+        step = GradientStep(gradients, optimizer, ["loss_objective"], watch={"the loss": agent.loss}, mode=mode)
+        index = torch.arange(16)
+        step(data, index)
+        data.set("advantage", -3 * data["advantage"] + 1)
+        results.append(step(data, index))
+    torch.testing.assert_close(*results, rtol=1e-5, atol=1e-6)

@@ -95,7 +95,7 @@ def test_a_compiled_advantage_follows_weights_settings_and_layouts():
     update(make_rollout())
     block: Any = update.advantage
     assert update._plan is not None
-    estimate = update._plan.estimate
+    estimate = update._plan.block
     assert isinstance(estimate, CompiledAdvantage) and estimate.native.rung == "recorded and compiled"
     other = make_rollout(3, rows=(64, 2)).transpose(0, 1)  # the same shape, other strides
     for rollout in (make_rollout(1), make_rollout(2), other):
@@ -266,6 +266,53 @@ def test_every_row_is_seen_once_an_epoch_and_in_another_order():
     expected = rollout["observation"].reshape(-1, 3).sort(0)[0]
     assert torch.equal(epochs[0].sort(0)[0], expected) and torch.equal(epochs[1].sort(0)[0], expected)
     assert not torch.equal(epochs[0], epochs[1])
+
+
+@pytest.mark.parametrize("compile", ["off", "on"])
+def test_accumulated_minibatches_are_one_larger_one(compile):
+    """Weighted by their rows: 128 rows are 48 + 48 + 32, or (24 + 24) + (24 + 24) + (24 + 8)."""
+    loss = partial(losses.ClipPPOLoss, normalize_advantage=False)
+    settings = {"dtype": torch.float64, "loss_class": loss}
+    update = make_agent(minibatch_size=24, accumulate=2, compile=compile, **settings)
+    twin = make_agent(minibatch_size=48, **settings)
+    for i in range(2):
+        got, expected = (agent(make_rollout(i, torch.float64)) for agent in (update, twin))
+        assert {name: got[name] for name in ("loss_objective", "grad_norm", "epochs")} == pytest.approx(
+            {name: expected[name] for name in ("loss_objective", "grad_norm", "epochs")}, rel=1e-6
+        )
+    torch.testing.assert_close(parameters(update), parameters(twin), rtol=0, atol=1e-6)
+    assert update._plan is not None
+    assert [native.seconds > 0 for native in update._plan.native] == [compile == "on"] * 2
+
+
+def test_something_between_gradient_and_optimizer():
+    settings = {"optimizer": torch.optim.SGD, "dtype": torch.float64, "max_grad_norm": None, "epochs": 1}
+    doubled, twin = make_agent(**settings), make_agent(**settings)
+    doubled.between = lambda grads: [2 * grad for grad in grads]
+    twin.optimizer.param_groups[0]["lr"] *= 2
+    for update in (doubled, twin):
+        update(make_rollout(0, torch.float64))
+    torch.testing.assert_close(parameters(doubled), parameters(twin), rtol=1e-12, atol=1e-12)
+
+
+def test_an_augmentation_is_part_of_the_step_and_draws_anew():
+    class Noise(torch.nn.Module):
+        scale = 0.5
+
+        def forward(self, batch):
+            return batch.set("observation", batch["observation"] + self.scale * torch.randn_like(batch["observation"]))
+
+    results = []
+    for compile in ("off", "on"):
+        update = make_agent(augment=Noise(), compile=compile, dtype=torch.float64, epochs=1)
+        torch.manual_seed(5)
+        metrics = [update(make_rollout(0, torch.float64)) for _ in range(2)]
+        results.append((metrics, parameters(update)))
+    (eager, expected), (compiled, got) = results
+    assert all(a == pytest.approx(b, rel=1e-5, abs=1e-7) for a, b in zip(eager, compiled, strict=True))
+    torch.testing.assert_close(got, expected, rtol=0, atol=1e-5)
+    plain = make_agent(dtype=torch.float64, epochs=1)
+    assert plain(make_rollout(0, torch.float64))["loss_critic"] != pytest.approx(eager[0]["loss_critic"], rel=1e-3)
 
 
 def test_target_kl_stops_after_the_epoch():
