@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from logging import getLogger
 from typing import Any
 
 import torch
@@ -10,11 +11,12 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
+from torch.overrides import TorchFunctionMode
 from torchrl.data import MultiCategorical, TensorSpec
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import OrnsteinUhlenbeckProcessModule
 
-from pgkit.compiled import Mode, compiled
+from pgkit.compiled import Mode, compiled, undone
 from pgkit.envs import VectorEnv
 from pgkit.envs.vector import whole
 from pgkit.errors import UserError
@@ -85,18 +87,33 @@ def policy(
         return tuple(out[key] for key in keys)
 
     def others(_: None, obs: Tensor, *state: Tensor) -> list[tuple[Any, ...]]:
-        return [(None, _other(obs, draw), *state) for draw in range(3)]
+        return [(None, _other(obs, seed, spread), *state) for seed, spread in enumerate((0.1, 1.0, 10.0))]
 
     mode = "record" if mode == "off" else mode
+    with torch.no_grad(), _LeavesTorch() as leaves:
+        undone(actor.buffers(), lambda: act(None, obs, *remembered.values()))
+    if leaves.seen:
+        getLogger("pgkit").info("the policy computes outside torch: it is called as it is, several times slower")
+        mode = "off"
     native = compiled(act, watch={"the actor": actor}, others=others, mode=mode, name="the policy")
     return native, obs, *remembered.values()
 
 
-def _other(obs: Tensor, seed: int) -> Tensor:
+class _LeavesTorch(TorchFunctionMode):
+    """Notices tensors that become numpy arrays or lists: what is computed from those is a constant of a record."""
+
+    seen = False
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        self.seen |= func in (Tensor.numpy, Tensor.tolist, Tensor.__array__)
+        return func(*args, **(kwargs or {}))
+
+
+def _other(obs: Tensor, seed: int, spread: float) -> Tensor:
     """Other observations of the same type: noise on numbers, any pixels, flags and integers in another order."""
     draw = torch.Generator(obs.device).manual_seed(seed)
     if obs.dtype.is_floating_point:
-        return obs + 0.1 * torch.rand(obs.shape, generator=draw, dtype=obs.dtype, device=obs.device)
+        return obs + spread * torch.randn(obs.shape, generator=draw, dtype=obs.dtype, device=obs.device)
     if obs.dtype is torch.uint8:
         return torch.randint(256, obs.shape, generator=draw, dtype=obs.dtype, device=obs.device)
     return obs.flatten()[torch.randperm(obs.numel(), generator=draw, device=obs.device)].view_as(obs)

@@ -105,7 +105,10 @@ class Compiled:
             self._built.clear()
         layout = _layout(data, inputs)
         if layout not in self._built:
+            if len(self._built) == _MOST_LAYOUTS:
+                getLogger("pgkit").warning("%s runs without: its data has more than 4 layouts", self.name)
             if len(self._built) >= _MOST_LAYOUTS:
+                self._built[layout] = lambda data: partial(self.function, data)
                 return partial(self.function, data)
             start = time.perf_counter()
             self._built[layout] = self._build(data, inputs)
