@@ -9,7 +9,6 @@ import pytest
 ROOT = Path(__file__).parent.parent
 PGKIT = ROOT / "pgkit"
 FREE = {"torch", "tensordict", "errors", "seams"}
-BEFORE_COMPILED = {"compiling", "constants"}  # what compiled/ takes the place of
 MAY_IMPORT = {
     "functional": set(),
     "heads": {"functional"},
@@ -62,7 +61,7 @@ def loss_modules(path: Path):
 def outside(folder: str, path: Path):
     """Imports of ``path`` that the table forbids; errors, seams and a folder's own are free."""
     governed = {"torchrl", "gymnasium", "recipes", *MAY_IMPORT, *(file.stem for file in PGKIT.glob("[a-z]*.py"))}
-    return set(imports(path)) & governed - MAY_IMPORT[folder] - FREE - BEFORE_COMPILED - {folder}
+    return set(imports(path)) & governed - MAY_IMPORT[folder] - FREE - {folder}
 
 
 @pytest.mark.parametrize("folder", MAY_IMPORT)

@@ -58,16 +58,17 @@ class LossView:
         params = self.networks().get(network, (None, None))[1]
         return [] if params is None else list(params.values(True, True))
 
-    def delayed(self) -> list[tuple[TensorDictBase, TensorDictBase]]:
-        """``(target, source)`` parameters of each network that has a target network.
+    def delayed(self) -> dict[str, tuple[TensorDictBase, TensorDictBase]]:
+        """``name -> (target, source)``: the parameters of each network that has a target network.
 
         The loss is told that its targets are taken care of, as TorchRL's ``SoftUpdate`` does.
         """
         if isinstance(self.loss, LossModule):
             self.loss._has_update_associated.update(dict.fromkeys(self.loss._has_update_associated, True))
         children = dict[str, Any](self.loss.named_children())
-        targets = [name for name in children if name.startswith("target_") and name.endswith("_params")]
-        return [(children[name], children[name.removeprefix("target_")]) for name in targets]
+        networks = [name.removesuffix("_params") for name in children if name.endswith("_params")]
+        pairs = {name: (children.get(f"target_{name}_params"), children[f"{name}_params"]) for name in networks}
+        return {name: (target, source) for name, (target, source) in pairs.items() if target is not None}
 
     def distribution(self, batch: TensorDictBase) -> Any:
         """The actor's distribution at the batch's observations; None for an actor without one."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any, Protocol
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDictBase
@@ -16,46 +16,13 @@ from pgkit.errors import UserError
 Draw = tuple[TensorDictBase, Tensor]
 
 
-class Batches(Protocol):
-    """A source of batches for :class:`~pgkit.updates.GradientStep`.
-
-    Attributes:
-        capacity: frames that there can be to draw from.
-    """
-
-    capacity: int
-
-    def extend(self, rollout: TensorDictBase) -> None:
-        """Stores a rollout."""
-        ...
-
-    def draw(self, batches: int) -> Iterator[Draw]:
-        """Pairs ``(data, index)``, one a gradient step."""
-        ...
-
-    def gather(self, data: TensorDictBase, index: Tensor) -> TensorDictBase:
-        """The batch of a pair, in the graph."""
-        ...
-
-    def write_back(self, data: TensorDictBase, index: Tensor, batch: TensorDictBase) -> None:
-        """The batch's priorities to where they belong, in the graph."""
-        ...
-
-    def written(self) -> list[Tensor]:
-        """What :meth:`write_back` changes, besides ``data``."""
-        ...
-
-    def drawn(self) -> None:
-        """Called after each step, outside the graph."""
-        ...
-
-    def settings(self) -> dict[str, Any]:
-        """Objects with a ``gamma`` of their own, by name."""
-        ...
-
-
 class OwnBatches:
-    """From pgkit's replay: only row numbers are drawn, the rest is in the graph."""
+    """From pgkit's replay: only row numbers are drawn, the rest is in the graph.
+
+    :meth:`extend` stores a rollout; :meth:`draw` gives a pair ``(data, index)`` a step, :meth:`gather` the batch of a
+    pair and :meth:`write_back` takes its priorities, both in the graph; :meth:`written` is what that changes besides
+    the data; :meth:`drawn` follows each step, outside the graph; :meth:`settings` has the owners of a ``gamma``.
+    """
 
     def __init__(self, buffer: ReplayBuffer, loss: nn.Module, batch_size: int) -> None:
         self.buffer, self.view, self.batch_size = buffer, LossView(loss), batch_size
@@ -95,14 +62,16 @@ class OwnBatches:
 
 
 class TorchRLBatches:
-    """From a TorchRL replay buffer: its ``sample()`` is called for every step, ``td_error`` is written back to it."""
+    """From a TorchRL replay buffer: its ``sample()`` is called for every step, ``td_error`` is written back to it.
+
+    The methods are those of :class:`OwnBatches`.
+    """
 
     def __init__(self, buffer: Any, loss: nn.Module, batch_size: int) -> None:
         replay.check_replay(buffer)
         self.buffer, self.view, self.batch_size = buffer, LossView(loss), batch_size
         self.priority, self.prioritized = self.view.priority, replay.prioritized(buffer)
         self.capacity = buffer.storage.max_size
-        self._index = torch.arange(batch_size)
 
     def extend(self, rollout: TensorDictBase) -> None:
         replay.check_rollout(self.buffer, rollout)
@@ -112,15 +81,16 @@ class TorchRLBatches:
         for _ in range(batches):
             self._sample = self.buffer.sample(self.batch_size)
             data = self._sample.select(*self.view.readable(self._sample))
-            self._batch = data.set(self.priority, torch.zeros(self.batch_size))
-            yield self._batch, self._index
+            self._batch = data.set(self.priority, torch.zeros(self.batch_size, device=data.device))
+            yield self._batch, torch.arange(self.batch_size, device=data.device)
 
     def gather(self, data: TensorDictBase, index: Tensor) -> TensorDictBase:
-        return data.exclude(self.priority)
+        rows = data.exclude(self.priority)
+        return rows if len(index) == self.batch_size else cast(TensorDictBase, rows[index])
 
     def write_back(self, data: TensorDictBase, index: Tensor, batch: TensorDictBase) -> None:
         if self.prioritized:
-            data[self.priority].copy_(batch[self.priority].flatten())
+            data[self.priority].index_copy_(0, index, batch[self.priority].flatten().to(data[self.priority].dtype))
 
     def written(self) -> list[Tensor]:
         return []
@@ -131,3 +101,6 @@ class TorchRLBatches:
 
     def settings(self) -> dict[str, Any]:
         return replay.transforms(self.buffer)
+
+
+Batches = OwnBatches | TorchRLBatches

@@ -23,7 +23,7 @@ def test_what_the_block_returns_counts():
         update.advantage, update.loss.normalize_advantage = halved, False
         metrics.append(update(make_rollout()))
     assert metrics[0] == metrics[1]
-    update.advantage = update._estimate = lambda rollout: None
+    update.advantage = lambda rollout: None
     with pytest.raises(UserError, match="the advantage block <lambda> returned a NoneType: return the rollout"):
         update(make_rollout())
 
