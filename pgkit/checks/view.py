@@ -31,7 +31,7 @@ class LossView:
 
     Attributes:
         name, advantage_name: what a message calls the two.
-        in_keys, out_keys: what the loss says it reads, and that its result has; nothing where it does not say.
+        in_keys: what the loss says it reads; nothing where it does not say.
         inputs: what the loss's networks read.
         estimates: what the advantage block writes.
     """
@@ -39,10 +39,15 @@ class LossView:
     def __init__(self, loss: nn.Module, advantage: Any = None, source: str = "the rollout") -> None:
         self.loss, self.advantage, self.source = loss, advantage, source
         self.name, self.advantage_name = name_of(loss), name_of(advantage)
-        self.in_keys, self.out_keys = keys_of(loss, "in_keys"), keys_of(loss, "out_keys")
+        self.in_keys = keys_of(loss, "in_keys")
         self.inputs = list(dict.fromkeys(key for net, _ in self.networks().values() for key in net.in_keys))
         expected = [] if advantage is None else [*self.keys("advantage"), *self.keys("value_target")]
         self.estimates = keys_of(advantage, "out_keys") or expected  # of a function: what the loss expects of it
+
+    @property
+    def out_keys(self) -> list[Any]:
+        """Entries of the loss's result; nothing where it does not say."""
+        return keys_of(self.loss, "out_keys")
 
     def networks(self) -> dict[str, tuple[Any, Any]]:
         """``name -> (module, parameters)`` of the networks that a TorchRL loss holds; of a stack the first member."""
