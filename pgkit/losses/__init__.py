@@ -1,14 +1,13 @@
 """Losses: one file an algorithm, each a TorchRL ``LossModule``."""
 
 from pgkit.losses.a2c import A2CLoss
-from pgkit.losses.actor_critic_base import ActorCriticLoss
 from pgkit.losses.base import Loss
 from pgkit.losses.clip_ppo import ClipPPOLoss
 from pgkit.losses.crossq import CrossQLoss
 from pgkit.losses.ddpg import DDPGLoss
 from pgkit.losses.discrete_sac import DiscreteSACLoss
 from pgkit.losses.kl_pen_ppo import KLPENPPOLoss
-from pgkit.losses.policy_base import PolicyLoss
+from pgkit.losses.policy_base import ActorCriticLoss, PolicyLoss
 from pgkit.losses.q_base import QLoss
 from pgkit.losses.redq import REDQLoss
 from pgkit.losses.reinforce import ReinforceLoss

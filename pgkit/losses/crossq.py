@@ -4,19 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, dispatch
 from torch import nn
+from typing_extensions import Unpack
 
 from pgkit.functional import same_shape
 from pgkit.losses.q_base import Critics
 from pgkit.losses.soft_base import SoftQLoss, SoftSettings
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
 
 
 class CrossQLoss(SoftQLoss):

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, dispatch
 from tensordict.utils import NestedKey
+from typing_extensions import Unpack
 
 from pgkit.errors import UserError
 from pgkit.losses.actors import refuse_stochastic
 from pgkit.losses.q_base import QLoss, QSettings
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
 
 
 class DDPGLoss(QLoss):

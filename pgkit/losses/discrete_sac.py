@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import log
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
@@ -12,15 +12,13 @@ from tensordict.nn import TensorDictModule, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import TensorSpec
+from typing_extensions import Unpack
 
 from pgkit.errors import UserError
 from pgkit.functional import expected_soft_value, straight_through_sample, twin_minimum
 from pgkit.heads import Returns, Scalar
 from pgkit.losses.q_base import Critics, Members
 from pgkit.losses.soft_base import SoftQLoss, SoftSettings
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
 
 
 class DiscreteSACLoss(SoftQLoss):

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from tensordict.nn import TensorDictModule
+from typing_extensions import Unpack
 
 from pgkit.losses.q_base import Critics
 from pgkit.losses.soft_base import SoftQLoss, SoftSettings
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
 
 
 class REDQLoss(SoftQLoss):

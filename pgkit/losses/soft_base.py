@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -10,15 +10,13 @@ from tensordict.nn import TensorDictModule, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.data import TensorSpec
+from typing_extensions import Unpack
 
 from pgkit.controllers import FixedTemperature, Temperature
 from pgkit.errors import UserError
 from pgkit.functional import ensemble_mean, random_subset, same_shape, twin_minimum
 from pgkit.losses.actors import action_spec_of, dimensions, need_distribution, need_kind
 from pgkit.losses.q_base import Critics, QLoss, QSettings
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
 
 _ACTOR_VALUES = {"min": twin_minimum, "mean": ensemble_mean}
 

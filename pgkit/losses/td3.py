@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -10,14 +10,12 @@ from tensordict.nn import TensorDictModule, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Bounded, TensorSpec
+from typing_extensions import Unpack
 
 from pgkit.errors import UserError
 from pgkit.functional import smoothed_action
 from pgkit.losses.actors import action_spec_of, refuse_stochastic
 from pgkit.losses.q_base import Critics, QLoss, QSettings
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
 
 
 class TD3Loss(QLoss):

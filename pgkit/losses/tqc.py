@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from tensordict.nn import TensorDictModule
+from typing_extensions import Unpack
 
 from pgkit.heads import Quantiles
 from pgkit.losses.q_base import Critics, head_of
 from pgkit.losses.soft_base import SoftQLoss, SoftSettings
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
 
 
 class TQCLoss(SoftQLoss):
