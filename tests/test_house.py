@@ -13,7 +13,7 @@ MAY_IMPORT = {
     "modules": {"heads", "torch", "tensordict", "torchrl"},
     "advantages": {"functional", "torch", "tensordict", "torchrl"},
     "controllers": {"functional", "torch"},
-    "losses": {"functional", "heads", "torch", "tensordict", "torchrl"},
+    "losses": {"functional", "heads", "controllers", "torch", "tensordict", "torchrl"},
     "updates": {"functional", "data", "torch", "tensordict"},
     "data": {"torch", "tensordict", "torchrl"},
     "collectors": {"envs", "torch", "tensordict", "torchrl"},
@@ -36,7 +36,7 @@ def imports(path: Path):
             yield (rest[0] if rest else "pgkit") if top == "pgkit" else top
 
 
-BASES = ("base", "policy_base", "actor_critic_base", "q_base", "soft_base")  # plumbing, no algorithm
+BASES = ("base", "actors", "policy_base", "q_base", "soft_base")  # plumbing, and the forward that a family shares
 
 
 def loss_modules(path: Path):

@@ -13,6 +13,7 @@ from pgkit.losses.redq import REDQLoss
 from pgkit.losses.reinforce import ReinforceLoss
 from pgkit.losses.sac import SACLoss
 from pgkit.losses.soft_base import SoftQLoss
+from pgkit.losses.sum import Sum
 from pgkit.losses.td3 import TD3Loss
 from pgkit.losses.tqc import TQCLoss
 from pgkit.losses.trpo import TRPOLoss
@@ -32,6 +33,7 @@ __all__ = [
     "ReinforceLoss",
     "SACLoss",
     "SoftQLoss",
+    "Sum",
     "TD3Loss",
     "TQCLoss",
     "TRPOLoss",
