@@ -147,16 +147,17 @@ def recorded_block(block: TensorDictModuleBase, data: TensorDictBase) -> Block:
         RuntimeError: the block decides something on a tensor's value, changes a buffer, or is too long to compile soon.
     """
     buffers = list(block.buffers())
+    present = [key for key in block.in_keys if key in data.keys(True)]  # of entries in two places, or a mask
 
     def flat(*leaves: Tensor) -> list[Tensor]:
         rows = TensorDict({}, batch_size=data.batch_size)
-        for key, leaf in zip(block.in_keys, leaves, strict=True):
+        for key, leaf in zip(present, leaves, strict=True):
             rows.set(key, leaf)
         out = block(rows)
         return [out.get(key) for key in block.out_keys]
 
     def inputs(data: TensorDictBase) -> list[Tensor]:
-        return [data.get(key) for key in block.in_keys]
+        return [data.get(key) for key in present]
 
     leaves = inputs(data)
 
