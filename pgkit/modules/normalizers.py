@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from pgkit.errors import UserError
 from pgkit.modules.ensemble import EnsembleLinear
-from pgkit.modules.sizes import observation_shape, spec_device
+from pgkit.modules.groups import agents
 
 
 class RunningMoments(nn.Module):
@@ -30,7 +30,13 @@ class RunningMoments(nn.Module):
     @torch.no_grad()
     def update(self, x: Tensor, mask: Tensor | None = None) -> None:
         """Takes in a batch ``[*B, *shape]``, of it the rows where ``mask [*B]`` is True."""
-        x = x.reshape(-1, *self.mean.shape) if mask is None else x[mask.reshape(x.shape[: x.dim() - self.mean.dim()])]
+        if mask is not None:
+            if mask.shape != x.shape[: mask.dim()] or mask.dim() > x.dim() - self.mean.dim():
+                raise UserError(
+                    f"a mask of shape {tuple(mask.shape)} does not choose among samples of {tuple(x.shape)}"
+                )
+            x = x[mask]
+        x = x.reshape(-1, *self.mean.shape)
         if len(x):
             self._take(x.to(self.mean.dtype))
 
@@ -62,7 +68,7 @@ class ObsNormalizer(RunningMoments):
     Args:
         env: an environment whose ``observation_spec`` has the entry ``observation``, or the shape itself.
         clip: bound of the result.
-        group: a group of agents, whose observations share one mean and deviation; found by itself if it is the only one.
+        group: a group of agents, whose observations share mean and deviation; found by itself if it is the only one.
         device: where it lives; by default the specs' device.
     """
 
@@ -79,7 +85,9 @@ class ObsNormalizer(RunningMoments):
         device: torch.device | str | None = None,
     ) -> None:
         given = isinstance(env, Sequence)  # a shape
-        super().__init__(env if given else observation_shape(env, group=group), device or (None if given else spec_device(env)))
+        who = None if given else agents(env, group, device=device)
+        shape = env if who is None else who.observation(who.key("observation")).shape
+        super().__init__(shape, device if who is None else who.device)
         self.clip = clip
         self.register_buffer("rest", torch.zeros_like(self.mean))
         self.register_buffer("moved", torch.zeros_like(self.mean, dtype=torch.float64))  # samples that do not rest

@@ -16,18 +16,21 @@ N, T, A = 3, 11, 2
 
 
 def group_rollout(own_flags=False, own_reward=True):
+    """Random steps; an observation leads to the next one, but where an episode, or an agent's, ends."""
     torch.manual_seed(0)
 
     def flags(*shape):
         done = torch.rand(N, T, *shape, 1) < 0.2
         return {"done": done, "terminated": done & (torch.rand(N, T, *shape, 1) < 0.5)}
 
-    following = flags() | ({} if own_reward else {"reward": torch.randn(N, T, 1)})
-    agents = {"observation": torch.randn(N, T, A, 4)} | (flags(A) if own_flags else {})
-    agents |= {"reward": torch.randn(N, T, A, 1)} if own_reward else {}
+    root, own = flags(), flags(A)
+    observation, final, reward = torch.randn(N, T, A, 4), torch.randn(N, T, A, 4), torch.randn(N, T, A, 1)
+    ended = own["done"] if own_flags else root["done"].unsqueeze(2)
+    after = torch.where(ended, final, observation.roll(-1, 1))
+    agents = {"observation": after, **(own if own_flags else {}), **({"reward": reward} if own_reward else {})}
+    following = {**root, **({} if own_reward else {"reward": reward[:, :, 0]})}
     acted = {
-        "observation": torch.randn(N, T, A, 4), "action": torch.randint(3, (N, T, A)),
-        "action_log_prob": torch.randn(N, T, A),
+        "observation": observation, "action": torch.randint(3, (N, T, A)), "action_log_prob": torch.randn(N, T, A),
     }  # fmt: skip
     return TensorDict(
         {"agents": TensorDict(acted, [N, T, A]), "next": {**following, "agents": TensorDict(agents, [N, T, A])}}, [N, T]
@@ -133,8 +136,9 @@ def test_set_keys_names_the_entries():
         reward=("agents", "pay"), done="ended", terminated="terminated", advantage="a", value_target=("x", "t")
     )
     out = block(rollout.copy())
-    plain = group_rollout()
-    plain["next", "done"], plain["next", "terminated"] = rollout["next", "done"], rollout["next", "terminated"]
+    plain = rollout.clone()
+    for name in ("done", "terminated"):
+        del plain["next", "agents", name]
     plain["next", "agents", "reward"] = 2 * rollout["next", "agents", "reward"]
     expected = advantages.GAE(group[0])(plain)
     assert torch.equal(out["a"], expected["agents", "advantage"])
