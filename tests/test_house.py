@@ -10,7 +10,7 @@ THIRD_PARTY = {"torch", "tensordict", "torchrl", "gymnasium"}
 MAY_IMPORT = {
     "functional": {"torch"},
     "heads": {"functional", "torch"},
-    "modules": {"heads", "torch", "tensordict", "torchrl"},
+    "modules": {"functional", "heads", "torch", "tensordict", "torchrl"},
     "advantages": {"functional", "torch", "tensordict", "torchrl"},
     "controllers": {"functional", "torch"},
     "losses": {"functional", "heads", "torch", "tensordict", "torchrl"},

@@ -14,7 +14,7 @@ from torchrl.data import TensorSpec
 from pgkit.errors import UserError
 from pgkit.modules.ensemble import EnsembleLinear
 from pgkit.modules.mlp import orthogonal
-from pgkit.modules.sizes import action_spec, groups, observation_spec, of_one_agent, spec_device
+from pgkit.modules.sizes import action_spec, groups, observation_spec, spec_device
 
 Share = bool | Sequence[int] | Mapping[Any, int]
 
@@ -70,13 +70,9 @@ class Agents:
         """Whether there is more than one set of parameters."""
         return max(self.sets, default=0) > 0
 
-    def example(self, key: NestedKey) -> Tensor:
-        """An observation of zeros ``[1, ...]``, with all agents of a group."""
-        return observation_spec(self.env, key).zero().unsqueeze(0).to(self.device)
-
     def _own(self, spec: TensorSpec, key: NestedKey) -> TensorSpec:
         mine = self.name is not None and not isinstance(key, str) and key[0] == self.name
-        return of_one_agent(spec, self.name) if mine else spec
+        return spec[0] if mine else spec
 
 
 def agents(

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import nn
 
 from pgkit.modules.sizes import layer_sizes
 
+Layer = TypeVar("Layer", bound=nn.Module)
 Linear = Callable[[int, int, Any], nn.Module]  # (inputs, outputs, gain); gain None: torch's initialization
 
 
@@ -48,8 +49,8 @@ def mlp(
     return nn.Sequential(*layers)
 
 
-def orthogonal(layer: nn.Linear, gain: float) -> nn.Linear:
-    """Initializes ``layer`` in place: orthogonal weight times ``gain``, zero bias."""
+def orthogonal(layer: Layer, gain: float) -> Layer:
+    """Initializes a linear layer or a convolution in place: orthogonal weight times ``gain``, zero bias."""
     nn.init.orthogonal_(layer.weight, gain)
     torch.nn.init.zeros_(layer.bias)
     return layer

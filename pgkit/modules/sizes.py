@@ -22,7 +22,7 @@ def observation_spec(env: Any, key: NestedKey = "observation") -> TensorSpec:
             f"the environment has no observation '{key}', only {', '.join(map(str, spec.keys(True, True)))}: pass "
             "encoder=modules.dict_encoder({name: module}) with those names"
         )
-    return _unbatched(spec[key], len(spec.shape))
+    return _unbatched(spec[key], len(spec.shape), key)
 
 
 def action_spec(env: Any, key: NestedKey = "action") -> TensorSpec:
@@ -31,7 +31,7 @@ def action_spec(env: Any, key: NestedKey = "action") -> TensorSpec:
     actions = env.full_action_spec if isinstance(env, EnvBase) else env.action_spec
     if key not in actions.keys(True):
         raise UserError(f"the environment has no action '{key}', only {', '.join(map(str, actions.keys(True, True)))}")
-    return _unbatched(actions[key], dims)
+    return _unbatched(actions[key], dims, key)
 
 
 def groups(env: Any) -> list[str]:
@@ -43,11 +43,6 @@ def groups(env: Any) -> list[str]:
 def spec_device(env: Any) -> torch.device | None:
     """Where the environment's tensors live."""
     return _specs(env).device
-
-
-def observation_shape(env: Any, key: NestedKey = "observation") -> torch.Size:
-    """Shape of one observation, without the environment's batch dimensions."""
-    return observation_spec(env, key).shape
 
 
 def box_action(spec: TensorSpec, needs_bounds: bool = False) -> TensorSpec:
@@ -74,16 +69,6 @@ def layer_sizes(hidden: Sequence[int]) -> list[int]:
     return list(hidden)
 
 
-def of_one_agent(spec: TensorSpec, group: str) -> TensorSpec:
-    """Spec of one agent out of that of all agents of a group; a ``UserError`` where they differ."""
-    if isinstance(spec, Stacked) or -1 in spec.shape:
-        raise UserError(
-            f"the agents of group '{group}' have different spaces, one network needs equal ones: put them into "
-            "groups of their own (group_map= of TorchRL's environments), and build a network for each"
-        )
-    return spec[0]
-
-
 def flat_size(shape: Sequence[int], key: NestedKey) -> int:
     """Number of features of one flat observation."""
     if len(shape) != 1:
@@ -104,7 +89,12 @@ def _specs(env: Any) -> Composite:
     return spec
 
 
-def _unbatched(spec: TensorSpec, dims: int) -> TensorSpec:
+def _unbatched(spec: TensorSpec, dims: int, key: NestedKey) -> TensorSpec:
+    if isinstance(spec, Stacked):
+        raise UserError(
+            f"the agents of group '{key[0]}' have different spaces, one network needs equal ones: put them into "
+            "groups of their own (group_map= of TorchRL's environments), and build a network for each"
+        )
     for _ in range(dims):
         spec = spec[0]
     return spec

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from pgkit.errors import UserError
 from pgkit.modules.groups import AgentIds, Agents, AllAgents, ForEachAgent
 from pgkit.modules.mlp import mlp
-from pgkit.modules.sizes import flat_size, observation_shape
+from pgkit.modules.sizes import flat_size, observation_spec
 
 Centralized = bool | NestedKey
 
@@ -165,5 +165,4 @@ def _zero(who: Agents, encoder: Any, key: NestedKey) -> Tensor:
         return torch.ones(1, 1, dtype=torch.bool)
     if name == "recurrent_state":
         return torch.zeros(1, *([] if isinstance(key, str) else [who.number]), encoder.state_size)
-    observation_shape(who.env, key)  # a UserError names the entries that there are
-    return who.example(key)
+    return observation_spec(who.env, key).zero().unsqueeze(0)
