@@ -61,7 +61,7 @@ class FixedTemperature(nn.Module):
 
     def __init__(self, alpha: float) -> None:
         super().__init__()
-        self.register_buffer("alpha", torch.tensor(float(alpha)))
+        self.register_buffer("alpha", torch.tensor(float(alpha), dtype=torch.float64))
 
     def loss(self, log_prob: Tensor) -> Tensor:
         """Zeros ``[*B]``."""

@@ -6,24 +6,25 @@ import torch
 from torch import Tensor
 
 
-def shift_images(x: Tensor, down: Tensor, right: Tensor, pad: int) -> Tensor:
+def shift_images(x: Tensor, down: Tensor, right: Tensor) -> Tensor:
     """Each image moved by whole pixels; its border is repeated where it moved away from.
 
     The random shift of DrQ (Kostrikov et al., 2021, https://arxiv.org/abs/2004.13649): pad by repeating the border,
-    then cut out a window. One gather for all images.
+    then cut out a window. Whole rows are copied first, then a gather moves them sideways: both fast on a CPU.
 
     Args:
         x: ``[B, channels, height, width]``, of any type.
-        down, right: int64 ``[B]``, from ``-pad`` to ``pad``.
-        pad: the furthest shift.
+        down, right: by how many pixels, int64 ``[B]``.
 
     Returns:
         As ``x``.
     """
-    rows, columns = (torch.arange(-pad, size + pad, device=x.device).clamp(0, size - 1) for size in x.shape[-2:])
-    padded = x.index_select(-2, rows).index_select(-1, columns)
-    windows = padded.unfold(-2, x.shape[-2], 1).unfold(-2, x.shape[-1], 1)  # [B, C, 2 pad + 1, 2 pad + 1, H, W]
-    return windows[torch.arange(len(x), device=x.device), :, pad - down, pad - right]
+    images, channels, height, width = x.shape
+    row = (torch.arange(height, device=x.device) - down.unsqueeze(-1)).clamp(0, height - 1)
+    column = (torch.arange(width, device=x.device) - right.unsqueeze(-1)).clamp(0, width - 1)
+    first = torch.arange(images * channels, device=x.device).reshape(images, channels, 1) * height
+    rows = x.reshape(-1, width).index_select(0, (first + row.unsqueeze(1)).flatten()).reshape(x.shape)
+    return rows.gather(-1, column[:, None, None].expand(x.shape))
 
 
 def quantized_pixels(x: Tensor, bits: int = 5) -> Tensor:

@@ -38,7 +38,7 @@ class RandomShift:
             if x is not None:
                 images = x.reshape(batch.numel(), -1, *x.shape[-2:])
                 down, right = torch.randint(-self.pad, self.pad + 1, (2, len(images)), device=x.device)
-                out.set(key, shift_images(images, down, right, self.pad).reshape(x.shape))
+                out.set(key, shift_images(images, down, right).reshape(x.shape))
         return out
 
     def __repr__(self) -> str:

@@ -101,7 +101,7 @@ class ObsNormalizer(RunningMoments):
         if self.count > 0:
             middle, deviation = self.mean, self.spread.sqrt()
         else:
-            self.rest.copy_(x.median(0).values)
+            self.rest.copy_(_order(x, 0.5))  # median() is wrong on expanded tensors
             middle, deviation = self.rest, _typical_distance(x - self.rest)
         self.moved.add_((x != self.rest).sum(0))
         super()._take(x.clamp(middle - self.clip * deviation, middle + self.clip * deviation))
@@ -109,9 +109,14 @@ class ObsNormalizer(RunningMoments):
         self.spread.copy_(torch.where(self.moved > 0, self.var * rarity, 1.0))
 
 
+def _order(x: Tensor, share: float) -> Tensor:
+    """The sample of ``x [n, ...]`` that this share of the others does not exceed."""
+    return x.kthvalue(floor(share * (len(x) - 1)) + 1, 0).values
+
+
 def _typical_distance(x: Tensor) -> Tensor:
     """The size that nine in ten of ``x [n, ...]`` do not exceed, over 1.645; 1 where that is 0."""
-    size = x.abs().kthvalue(floor(0.9 * (len(x) - 1)) + 1, 0).values
+    size = _order(x.abs(), 0.9)
     return torch.where(size > 0, size / 1.645, 1.0)
 
 

@@ -7,10 +7,8 @@ from pgkit.functional import quantized_pixels, shift_images
 def test_shift_by_hand():
     # one row and one column repeated where the image moved away
     x = torch.arange(1, 10).reshape(1, 1, 3, 3)
-    right, up = (
-        shift_images(x, torch.tensor([0]), torch.tensor([1]), 1),
-        shift_images(x, torch.tensor([-1]), torch.tensor([0]), 1),
-    )
+    one, none = torch.tensor([1]), torch.tensor([0])
+    right, up = shift_images(x, none, one), shift_images(x, -one, none)
     assert right.flatten().tolist() == [1, 1, 2, 4, 4, 5, 7, 7, 8]
     assert up.flatten().tolist() == [4, 5, 6, 7, 8, 9, 7, 8, 9]
 
@@ -20,7 +18,7 @@ def test_each_image_is_padded_and_cut_out(dtype):
     torch.manual_seed(0)
     x = torch.randint(256, (6, 3, 9, 11)).to(dtype)
     down, right = torch.randint(-4, 5, (2, 6))
-    out = shift_images(x, down, right, 4)
+    out = shift_images(x, down, right)
     assert out.dtype == dtype
     for i in range(6):
         padded = torch.nn.functional.pad(x[i : i + 1].float(), (4, 4, 4, 4), mode="replicate")[0]

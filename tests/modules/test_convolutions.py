@@ -6,6 +6,7 @@ from tensordict import TensorDict
 from torch import nn
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
+from torchrl.objectives import SoftUpdate
 
 from pgkit import controllers, losses, modules
 from pgkit.compiling import record
@@ -103,6 +104,7 @@ def test_the_critic_s_loss_alone_trains_shared_convolutions():
     batch["next"] = TensorDict(
         {"observation": images(N, 3, 20, 20), "reward": torch.randn(N, 1), "done": flag, "terminated": flag}, [N]
     )
+    SoftUpdate(loss, tau=0.01)  # TorchRL warns without
     out = loss(batch)
     assert encoder.convolutions is own.convolutions
     trained = {name: [g is not None and bool(g.any()) for g in gradients(out[name], encoder.convolutions)]
