@@ -227,7 +227,7 @@ def ends(rollout: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
     return following["reward"], following["done"], following["terminated"]
 
 
-def _path(key: NestedKey) -> tuple[str, ...]:
+def _path(key: NestedKey) -> tuple[Any, ...]:
     return (key,) if isinstance(key, str) else key
 
 

@@ -186,7 +186,10 @@ def _check(spec: Any, key: NestedKey) -> None:
         return
     if not spec.dtype.is_floating_point:
         raise UserError(f"'{key}' is {spec.dtype}, images are uint8, or floats within [0, 1]")
-    low, high = (float(spec.space.low.min()), float(spec.space.high.max())) if isinstance(spec, Bounded) else (0.0, 1.0)
+    space = spec.space if isinstance(spec, Bounded) else None
+    if space is None:
+        return
+    low, high = float(space.low.min()), float(space.high.max())
     if low < 0 or high > 1:
         raise UserError(
             f"'{key}' is a float image from {low:g} to {high:g}, expected [0, 1]: leave it uint8, or divide by 255"

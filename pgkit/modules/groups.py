@@ -70,7 +70,7 @@ class Agents:
         """Whether there is more than one set of parameters."""
         return max(self.sets, default=0) > 0
 
-    def _own(self, spec: TensorSpec, key: NestedKey) -> TensorSpec:
+    def _own(self, spec: Any, key: NestedKey) -> TensorSpec:
         mine = self.name is not None and not isinstance(key, str) and key[0] == self.name
         return spec[0] if mine else spec
 

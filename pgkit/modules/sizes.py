@@ -42,7 +42,8 @@ def groups(env: Any) -> list[str]:
 
 def spec_device(env: Any) -> torch.device | None:
     """Where the environment's tensors live."""
-    return _specs(env).device
+    device = _specs(env).device
+    return None if device is None else torch.device(device)
 
 
 def box_action(spec: TensorSpec, needs_bounds: bool = False) -> TensorSpec:
@@ -89,7 +90,7 @@ def _specs(env: Any) -> Composite:
     return spec
 
 
-def _unbatched(spec: TensorSpec, dims: int, key: NestedKey) -> TensorSpec:
+def _unbatched(spec: Any, dims: int, key: NestedKey) -> TensorSpec:
     if isinstance(spec, Stacked):
         raise UserError(
             f"the agents of group '{key[0]}' have different spaces, one network needs equal ones: put them into "

@@ -1,5 +1,7 @@
 """Builders for a group of agents: layouts, shared and separate parameters, centralized critics, one agent, errors."""
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -322,3 +324,36 @@ def test_modules_are_built_on_the_device_and_what_is_handed_in_stays():
         assert normalizer.mean.device.type == "cpu" and encoder.weight.device.type == "cpu"
         assert {x.device.type for name, x in net.named_buffers() if "mean" not in name and x.shape == (1,)} <= {"meta"}
     assert {x.device.type for x in modules.ObsNormalizer(env, device="meta").buffers()} == {"meta"}
+
+
+def test_specs_of_a_simulator_are_enough():
+    env = Single()
+    plain = SimpleNamespace(observation_spec=env.observation_spec, action_spec=env.full_action_spec)
+    data = TensorDict({"observation": torch.zeros(N, 5)}, [N])
+    assert modules.tanh_normal_actor(plain)(data)["action"].shape == (N, 2)
+    assert modules.q_value(plain)(data)["state_action_value"].shape == (N, 2)
+    with pytest.raises(UserError, match="sizes are read off a TorchRL environment, this is a str"):
+        modules.gaussian_actor("Pendulum-v1")
+
+
+def test_a_recurrent_critic_of_a_group_is_estimated_from():
+    torch.manual_seed(0)
+    env, steps = Team(), 6
+    core = modules.gru(env, 3, (4,))
+    critic = modules.state_value(env, encoder=core)
+    observation, is_init = torch.randn(N, steps + 1, A, 5), torch.zeros(N, steps + 1, 1, dtype=torch.bool)
+    state = torch.zeros(N, steps + 1, A, 3)
+    for t in range(steps):
+        state[:, t + 1] = core(observation[:, t], is_init[:, t], state[:, t])[1].detach()
+
+    def entries(part):
+        own = TensorDict({"observation": observation[:, part], "recurrent_state": state[:, part]}, [N, steps, A])
+        return {"agents": own, "is_init": is_init[:, part]}
+
+    ended = {key: torch.zeros(N, steps, 1, dtype=torch.bool) for key in ("done", "terminated")}
+    after = {**entries(slice(1, None)), **ended, "reward": torch.randn(N, steps, 1)}
+    rollout = TensorDict({**entries(slice(steps)), "next": after}, [N, steps])
+    out = advantages.GAE(critic, gamma=0.9, lmbda=0.0)(rollout.clone())
+    next_value = critic(rollout["next"].reshape(-1))["agents", "state_value"].detach().reshape(N, steps, A, 1)
+    expected = rollout["next", "reward"].unsqueeze(2) + 0.9 * next_value
+    torch.testing.assert_close(out["agents", "value_target"], expected)
