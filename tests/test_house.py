@@ -26,7 +26,7 @@ MAY_IMPORT = {
 }
 EVERYTHING = {"torchrl", "gymnasium", *MAY_IMPORT}
 MAY_IMPORT |= {"run": EVERYTHING, "cli": EVERYTHING | {"run"}}
-BASES = ("base", "policy_base", "actor_critic_base", "q_base", "soft_base")  # plumbing, no algorithm
+BASES = ("base", "actors", "policy_base", "q_base", "soft_base")  # plumbing, and the forward that a family shares
 
 
 def names(path: Path, for_types: bool = True):

@@ -13,6 +13,7 @@ from pgkit.functional.distributional import (
     two_hot,
 )
 from pgkit.functional.group_relative import group_relative
+from pgkit.functional.images import quantized_pixels, shift_images
 from pgkit.functional.returns import discounted_sum, generalized_advantage
 from pgkit.functional.smoothing import smoothed_action
 from pgkit.functional.soft import (
@@ -62,10 +63,12 @@ __all__ = [
     "policy_gradient",
     "quadratic_surrogate",
     "quantile_huber",
+    "quantized_pixels",
     "random_subset",
     "ratio_surrogate",
     "rollback_surrogate",
     "same_shape",
+    "shift_images",
     "smoothed_action",
     "soft_returns",
     "standardize",

@@ -1,7 +1,9 @@
 """Networks, actors, value operators and normalizers: TensorDict modules and their builders."""
 
 from pgkit.modules.actors import actor, gaussian_actor, tanh_normal_actor
+from pgkit.modules.augmentations import random_shift
 from pgkit.modules.bodies import Encoder, batch_renorm_mlp, ensemble_mlp, simba
+from pgkit.modules.convolutions import ConvEncoder, Detached, conv_encoder, decoder
 from pgkit.modules.deterministic import deterministic_actor
 from pgkit.modules.discrete import categorical_actor
 from pgkit.modules.encoders import dict_encoder
@@ -14,6 +16,8 @@ from pgkit.modules.recurrent import gru, lstm
 from pgkit.modules.values import state_value
 
 __all__ = [
+    "ConvEncoder",
+    "Detached",
     "Encoder",
     "EnsembleBatchRenorm",
     "EnsembleDropout",
@@ -27,6 +31,8 @@ __all__ = [
     "actor",
     "batch_renorm_mlp",
     "categorical_actor",
+    "conv_encoder",
+    "decoder",
     "deterministic_actor",
     "dict_encoder",
     "discrete_q_value",
@@ -36,6 +42,7 @@ __all__ = [
     "lstm",
     "mlp",
     "q_value",
+    "random_shift",
     "simba",
     "state_value",
     "tanh_normal_actor",
