@@ -13,6 +13,10 @@ class UserError(ValueError):
     """
 
 
+class Diverged(RuntimeError):
+    """A run's weights or losses are not finite. The command line prints one line and exits with 3."""
+
+
 def check_whole_number(least: int, **settings: Any) -> None:
     """Raises ``UserError`` for a setting that is no whole number, or below ``least``; None passes."""
     for name, value in settings.items():

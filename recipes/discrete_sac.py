@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
 from torchrl.data import LazyTensorStorage
+from torchrl.envs import EnvBase
 
-from pgkit import collectors, controllers, data, envs, losses, modules, run, updates
+from pgkit import collectors, controllers, data, losses, modules, run, updates
 
 
 @dataclass
@@ -29,51 +29,51 @@ class Args(run.RunArgs):
     """Envs stepped side by side."""
     threads: int = 2
     """Threads that PyTorch uses in this process; 2 is faster than 1 for networks 256 wide."""
-    steps: int = 1
+    steps: int = run.setting(1, low=1)
     """Steps each env takes between updates."""
     asynchronous: bool = False
     """Collect in another process while this one updates: rollouts are one update old, see train/policy_lag."""
-    random_frames: int = 1_000
+    random_frames: int = run.setting(1_000, low=0)
     """Frames with random actions at the start; updates begin after them."""
-    batch_size: int = 256
+    batch_size: int = run.setting(256, low=1)
     """Rows of a batch."""
-    updates_per_step: float = 1.0
+    updates_per_step: float = run.setting(1.0, low=0)
     """Gradient steps for each frame."""
-    actor_delay: int = 1
+    actor_delay: int = run.setting(1, low=1)
     """The actor and the temperature learn at every so many-th gradient step."""
-    learning_rate: float = 3e-4
+    learning_rate: float = run.setting(3e-4, low=0)
     """Adam's step size for the actor."""
-    q_learning_rate: float = 3e-4
+    q_learning_rate: float = run.setting(3e-4, low=0)
     """Adam's step size for the critics."""
-    alpha_learning_rate: float = 3e-4
+    alpha_learning_rate: float = run.setting(3e-4, low=0)
     """Adam's step size for the temperature."""
-    gamma: float = 0.99
+    gamma: float = run.setting(0.99, low=0, high=1)
     """Discount."""
-    tau: float = 0.005
+    tau: float = run.setting(0.005, low=0, high=1)
     """Share of the critics that their targets take over at each gradient step."""
-    alpha: float | None = None
+    alpha: float | None = run.setting(None, low=0)
     """A fixed temperature; None trains it."""
-    alpha_init: float = 1.0
+    alpha_init: float = run.setting(1.0, low=1e-8)
     """The trained temperature at the start."""
     target_entropy_weight: float = 0.98
     """The temperature holds the entropy at this share of the largest one, log(actions)."""
     form: Literal["expectation", "gumbel_softmax"] = "expectation"
     """Weigh all actions by their probability, or draw one with the gradient of its Gumbel-Softmax relaxation."""
-    relaxation: float = 1.0
+    relaxation: float = run.setting(1.0, above=0)
     """Temperature of that relaxation."""
-    buffer_size: int = 1_000_000
+    buffer_size: int = run.setting(1_000_000, low=1)
     """Frames that the replay buffer keeps."""
-    buffer_dir: Path | None = None
+    buffer_dir: Path | None = run.setting(None, on_resume=True)
     """Keep the replay buffer in files of this folder (a buffer beyond RAM); None keeps it in memory."""
-    n_step: int = 1
+    n_step: int = run.setting(1, low=1)
     """Length of the returns that the critics learn."""
     replay: Literal["uniform", "prioritized"] = "uniform"
     """Draw frames uniformly, or in proportion to the critics' errors."""
-    save_buffer: bool = False
+    save_buffer: bool = run.setting(False, on_resume=True)
     """Save the replay buffer beside each checkpoint, so that a resumed run goes on bit for bit."""
-    hidden: tuple[int, ...] = (256, 256)
+    hidden: tuple[int, ...] = run.setting((256, 256), low=1, high=2**16)
     """Sizes of the hidden layers, of actor and critics alike."""
-    log_every: int = 1_000
+    log_every: int = run.setting(1_000, low=1, on_resume=True)
     """A row of metrics every so many frames."""
 
 
@@ -86,20 +86,33 @@ PRESETS = {
 }  # fmt: skip
 
 
+def agent(args: Args, env: EnvBase) -> run.Agent:
+    """Networks, temperature and loss."""
+    actor = modules.categorical_actor(env, args.hidden, torch.nn.ReLU)
+    critics = modules.discrete_q_value(env, num_critics=2, hidden=args.hidden)
+    if args.alpha is not None:
+        temperature = controllers.FixedTemperature(args.alpha)
+    else:
+        actions: Any = env.action_spec_unbatched.space
+        target_entropy = args.target_entropy_weight * math.log(actions.n)
+        temperature = controllers.Temperature(target_entropy, args.alpha_init)
+    loss = losses.DiscreteSACLoss(
+        actor,
+        critics,
+        temperature=temperature,
+        form=args.form,
+        relaxation=args.relaxation,
+        gamma=args.gamma,
+    )
+    return run.Agent(actor, loss, critics, controller=temperature)
+
+
 def main(args: Args) -> None:
     """Trains, logs, evaluates, saves."""
     with run.Run(args, recipe="discrete_sac") as log:
-        make_env = partial(envs.make, args.env_id)
-        env = make_env(num_envs=args.num_envs, seed=args.seed, workers=args.workers)
-        actor = modules.categorical_actor(env, args.hidden, torch.nn.ReLU)
-        critics = modules.discrete_q_value(env, num_critics=2, hidden=args.hidden)
-        if args.alpha is not None:
-            temperature = controllers.FixedTemperature(args.alpha)
-        else:
-            actions: Any = env.action_spec_unbatched.space
-            target_entropy = args.target_entropy_weight * math.log(actions.n)
-            temperature = controllers.Temperature(target_entropy, args.alpha_init)
-
+        env = args.make_env(args.num_envs, args.seed, args.workers)
+        with run.placed(args):
+            built = agent(args, env)
         buffer = data.ReplayBuffer(
             env,
             args.buffer_size,
@@ -108,19 +121,12 @@ def main(args: Args) -> None:
             storage=data.in_files(args.buffer_dir) if args.buffer_dir else LazyTensorStorage,
         )
         groups = [
-            {"params": list(actor.parameters()), "lr": args.learning_rate},
-            {"params": list(critics.parameters()), "lr": args.q_learning_rate},
-            {"params": list(temperature.parameters()), "lr": args.alpha_learning_rate},
+            {"params": list(built.actor.parameters()), "lr": args.learning_rate},
+            {"params": list(built.critic.parameters()), "lr": args.q_learning_rate},
+            {"params": list(built.controller.parameters()), "lr": args.alpha_learning_rate},
         ]
         update = updates.OffPolicyUpdate(
-            loss=losses.DiscreteSACLoss(
-                actor,
-                critics,
-                temperature=temperature,
-                form=args.form,
-                relaxation=args.relaxation,
-                gamma=args.gamma,
-            ),
+            loss=built.loss,
             buffer=buffer,
             optimizer=torch.optim.Adam([group for group in groups if group["params"]]),
             batch_size=args.batch_size,
@@ -134,7 +140,7 @@ def main(args: Args) -> None:
         make_collector = collectors.AsyncCollector if args.asynchronous else collectors.VectorCollector
         collector = make_collector(
             env,
-            actor,
+            built.actor,
             frames_per_batch=args.num_envs * args.steps,
             total_frames=args.total_frames,
             init_random_frames=args.random_frames,
@@ -142,13 +148,12 @@ def main(args: Args) -> None:
         )
 
         replay = data.BesideCheckpoint(buffer, log.dir / "checkpoints" / "buffer.pt", save=args.save_buffer)
-        log.track(policy=actor, eval_env=make_env, update=update, collector=collector, replay=replay)
+        log.track(agent=built, eval_env=args.make_env, update=update, collector=collector, replay=replay)
         for rollout in collector:
             metrics = update(rollout)
             if args.asynchronous:
                 metrics["policy_lag"] = collector.lag
-            compile_seconds = update.compile_seconds + collector.compile_seconds
-            log.step(collector.frames, rollout, metrics, compile_seconds=compile_seconds, every=args.log_every)
+            log.step(collector.frames, rollout, metrics, every=args.log_every)
         collector.shutdown()
 
 

@@ -7,15 +7,15 @@ in ``PRESETS`` below.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 from typing import Literal
 
 import torch
 from tensordict.nn import TensorDictSequential
+from torchrl.envs import EnvBase
 from torchrl.modules import EGreedyModule, QValueActor
 from torchrl.objectives import DQNLoss
 
-from pgkit import collectors, data, envs, modules, run, updates
+from pgkit import collectors, data, modules, run, updates
 from pgkit.errors import UserError
 
 
@@ -27,63 +27,69 @@ class Args(run.RunArgs):
     """Gymnasium id with one discrete action."""
     num_envs: int = 4
     """Envs stepped side by side."""
-    steps: int = 1
+    steps: int = run.setting(1, low=1)
     """Steps each env takes between updates."""
-    random_frames: int = 1_000
+    random_frames: int = run.setting(1_000, low=0)
     """Frames with random actions at the start; updates begin after them."""
-    batch_size: int = 64
+    batch_size: int = run.setting(64, low=1)
     """Rows of a batch."""
-    updates_per_step: float = 0.25
+    updates_per_step: float = run.setting(0.25, low=0)
     """Gradient steps for each frame."""
-    learning_rate: float = 5e-4
+    learning_rate: float = run.setting(5e-4, low=0)
     """Adam's step size."""
-    max_grad_norm: float | None = 10.0
+    max_grad_norm: float | None = run.setting(10.0, above=0)
     """Bound of the gradient's norm; None is none."""
     loss_function: Literal["smooth_l1", "l2"] = "smooth_l1"
     """Distance of value and target."""
-    gamma: float = 0.99
+    gamma: float = run.setting(0.99, low=0, high=1)
     """Discount."""
-    tau: float = 0.005
+    tau: float = run.setting(0.005, low=0, high=1)
     """Share of the network that its target takes over at each gradient step."""
     double: bool = True
     """Choose the next action by the trained network, and value it by the target (van Hasselt et al., 2016)."""
-    epsilon_end: float = 0.05
+    epsilon_end: float = run.setting(0.05, low=0, high=1)
     """Share of random actions in the end; it begins at 1."""
-    epsilon_frames: int = 20_000
+    epsilon_frames: int = run.setting(20_000, low=0)
     """Frames over which that share falls, in a straight line."""
-    buffer_size: int = 100_000
+    buffer_size: int = run.setting(100_000, low=1)
     """Frames that the replay buffer keeps."""
-    n_step: int = 1
+    n_step: int = run.setting(1, low=1)
     """Length of the returns that the network learns."""
     replay: Literal["uniform", "prioritized"] = "uniform"
     """Draw frames uniformly, or in proportion to the network's errors."""
-    save_buffer: bool = False
+    save_buffer: bool = run.setting(False, on_resume=True)
     """Save the replay buffer beside each checkpoint, so that a resumed run goes on bit for bit."""
-    hidden: tuple[int, ...] = (128, 128)
+    hidden: tuple[int, ...] = run.setting((128, 128), low=1, high=2**16)
     """Sizes of the hidden layers."""
-    log_every: int = 1_000
+    log_every: int = run.setting(1_000, low=1, on_resume=True)
     """A row of metrics every so many frames."""
 
 
 PRESETS = {"CartPole-*": dict(total_frames=100_000, eval_every=10_000, n_step=10, batch_size=256, tau=0.01)}
 
 
+def agent(args: Args, env: EnvBase) -> run.Agent:
+    """Network, loss and exploration."""
+    actions = getattr(env.action_spec_unbatched.space, "n", None)
+    if actions is None:
+        raise UserError(f"dqn needs one discrete action, '{args.env_id}' has another action space: use sac or td3")
+    sizes = (env.observation_spec_unbatched["observation"].shape[-1], actions)
+    net = modules.mlp(*sizes, args.hidden, torch.nn.ReLU)
+    actor = QValueActor(net, in_keys=["observation"], action_space="categorical")
+    settings = {"loss_function": args.loss_function, "double_dqn": args.double}
+    loss = DQNLoss(actor, action_space="categorical", delay_value=True, **settings)
+    loss.make_value_estimator(gamma=args.gamma)
+    explore = EGreedyModule(env.action_spec, 1.0, args.epsilon_end, args.epsilon_frames)
+    return run.Agent(actor, loss, explorer=TensorDictSequential(actor, explore))
+
+
 def main(args: Args) -> None:
     """Trains, logs, evaluates, saves."""
     with run.Run(args, recipe="dqn") as log:
-        make_env = partial(envs.make, args.env_id)
-        env = make_env(num_envs=args.num_envs, seed=args.seed, workers=args.workers)
-        actions = getattr(env.action_spec_unbatched.space, "n", None)
-        if actions is None:
-            raise UserError(f"dqn needs one discrete action, '{args.env_id}' has another action space: use sac or td3")
-        sizes = (env.observation_spec_unbatched["observation"].shape[-1], actions)
-        net = modules.mlp(*sizes, args.hidden, torch.nn.ReLU)
-        actor = QValueActor(net, in_keys=["observation"], action_space="categorical")
-        explore = EGreedyModule(env.action_spec, 1.0, args.epsilon_end, args.epsilon_frames)
-
-        settings = {"loss_function": args.loss_function, "double_dqn": args.double}
-        loss = DQNLoss(actor, action_space="categorical", delay_value=True, **settings)
-        loss.make_value_estimator(gamma=args.gamma)
+        env = args.make_env(args.num_envs, args.seed, args.workers)
+        with run.placed(args):
+            built = agent(args, env)
+        explore = built.explorer[-1]
         buffer = data.ReplayBuffer(
             env,
             args.buffer_size,
@@ -91,9 +97,9 @@ def main(args: Args) -> None:
             sampler=data.Prioritized(alpha=0.3) if args.replay == "prioritized" else None,  # of squared errors: |.|^0.6
         )
         update = updates.OffPolicyUpdate(
-            loss=loss,
+            loss=built.loss,
             buffer=buffer,
-            optimizer=torch.optim.Adam(actor.parameters(), lr=args.learning_rate),
+            optimizer=torch.optim.Adam(built.parameters(), lr=args.learning_rate),
             batch_size=args.batch_size,
             updates_per_step=args.updates_per_step,
             tau=args.tau,
@@ -104,7 +110,7 @@ def main(args: Args) -> None:
         )
         collector = collectors.VectorCollector(
             env,
-            TensorDictSequential(actor, explore),
+            built.explorer,
             frames_per_batch=args.num_envs * args.steps,
             total_frames=args.total_frames,
             init_random_frames=args.random_frames,
@@ -112,14 +118,12 @@ def main(args: Args) -> None:
         )
 
         replay = data.BesideCheckpoint(buffer, log.dir / "checkpoints" / "buffer.pt", save=args.save_buffer)
-        tracked = {"update": update, "collector": collector, "explore": explore, "replay": replay}
-        log.track(policy=actor, eval_env=make_env, **tracked)
+        log.track(agent=built, eval_env=args.make_env, update=update, collector=collector, replay=replay)
         for rollout in collector:
             metrics = update(rollout)
             explore.step(rollout.numel())
             metrics["epsilon"] = float(explore.eps)
-            compile_seconds = update.compile_seconds + collector.compile_seconds
-            log.step(collector.frames, rollout, metrics, compile_seconds=compile_seconds, every=args.log_every)
+            log.step(collector.frames, rollout, metrics, every=args.log_every)
         collector.shutdown()
 
 

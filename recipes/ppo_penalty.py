@@ -6,12 +6,12 @@ The defaults are the MuJoCo settings; tuned values for other environments are in
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 from typing import Literal
 
 import torch
+from torchrl.envs import EnvBase
 
-from pgkit import advantages, collectors, controllers, envs, losses, modules, run, updates
+from pgkit import advantages, collectors, controllers, losses, modules, run, updates
 
 
 @dataclass
@@ -24,29 +24,29 @@ class Args(run.RunArgs):
     """Env steps to train for, all envs together."""
     eval_every: int = 100_000
     """Evaluate and save a checkpoint every so many frames; 0 = only at the end."""
-    steps: int = 256
+    steps: int = run.setting(256, low=1)
     """Steps each env takes for one rollout."""
-    epochs: int = 10
+    epochs: int = run.setting(10, low=1)
     """Passes over a rollout."""
-    minibatch_size: int = 64
+    minibatch_size: int = run.setting(64, low=1)
     """Rows of a minibatch."""
-    learning_rate: float = 3e-4
+    learning_rate: float = run.setting(3e-4, low=0)
     """Adam's step size."""
-    anneal: bool = False
+    anneal: bool = run.setting(False, follows="total_frames")
     """Let the learning rate fall to zero in a straight line."""
-    gamma: float = 0.99
+    gamma: float = run.setting(0.99, low=0, high=1)
     """Discount."""
-    lmbda: float = 0.95
+    lmbda: float = run.setting(0.95, low=0, high=1)
     """GAE's lambda."""
-    kl_target: float = 0.01
+    kl_target: float = run.setting(0.01, low=0)
     """KL divergence of an update that the penalty's weight aims at."""
-    beta: float = 1.0
+    beta: float = run.setting(1.0, low=0)
     """Weight of the penalty at the start."""
     entropy_coeff: float = 0.0
     """Weight of the entropy bonus."""
-    critic_coeff: float = 0.25
+    critic_coeff: float = run.setting(0.25, low=0)
     """Weight of the value loss."""
-    max_grad_norm: float = 0.5
+    max_grad_norm: float = run.setting(0.5, above=0)
     """Bound of the gradient's norm."""
     normalize_advantage: Literal["rollout", "minibatch", "off"] = "rollout"
     """Standardize the advantage over the whole rollout, over each minibatch, or not at all."""
@@ -56,7 +56,7 @@ class Args(run.RunArgs):
     """Normalize observations by their running mean and deviation."""
     scale_returns: bool = True
     """Let the critic learn returns divided by their running deviation; rewards stay as they are."""
-    hidden: tuple[int, ...] = (64, 64)
+    hidden: tuple[int, ...] = run.setting((64, 64), low=1, high=2**16)
     """Sizes of the hidden layers, of actor and critic alike."""
     log_std: float = -0.5
     """Initial log standard deviation of a continuous policy."""
@@ -77,40 +77,46 @@ PRESETS = {
 }  # fmt: skip
 
 
+def agent(args: Args, env: EnvBase) -> run.Agent:
+    """Networks, loss with its penalty, and advantage."""
+    normalizer = modules.ObsNormalizer(env) if args.normalize_obs else None
+    scale = modules.ReturnScale() if args.scale_returns else None
+
+    if env.action_spec.dtype.is_floating_point:
+        actor = modules.gaussian_actor(env, args.hidden, log_std=args.log_std, normalizer=normalizer)
+    else:
+        actor = modules.categorical_actor(env, args.hidden, normalizer=normalizer)
+    critic = modules.state_value(env, args.hidden, normalizer=normalizer)
+
+    penalty = controllers.AdaptiveKL(args.kl_target, args.beta)
+    loss = losses.KLPENPPOLoss(
+        actor,
+        critic,
+        controller=penalty,
+        entropy_coeff=args.entropy_coeff,
+        critic_coeff=args.critic_coeff,
+        normalize_advantage=args.normalize_advantage == "minibatch",
+    )
+    advantage = advantages.GAE(
+        critic,
+        gamma=args.gamma,
+        lmbda=args.lmbda,
+        average_gae=args.normalize_advantage == "rollout",
+        return_scale=scale,
+    )
+    return run.Agent(actor, loss, critic, advantage, normalizer=normalizer, scale=scale, controller=penalty)
+
+
 def main(args: Args) -> None:
     """Trains, logs, evaluates, saves."""
     with run.Run(args, recipe="ppo_penalty") as log:
-        env = envs.make(args.env_id, num_envs=args.num_envs, seed=args.seed, workers=args.workers)
-        normalizer = modules.ObsNormalizer(env) if args.normalize_obs else None
-        scale = modules.ReturnScale() if args.scale_returns else None
-
-        if env.action_spec.dtype.is_floating_point:
-            actor = modules.gaussian_actor(env, args.hidden, log_std=args.log_std, normalizer=normalizer)
-        else:
-            actor = modules.categorical_actor(env, args.hidden, normalizer=normalizer)
-        critic = modules.state_value(env, args.hidden, normalizer=normalizer)
-
-        penalty = controllers.AdaptiveKL(args.kl_target, args.beta)
-        loss = losses.KLPENPPOLoss(
-            actor,
-            critic,
-            controller=penalty,
-            entropy_coeff=args.entropy_coeff,
-            critic_coeff=args.critic_coeff,
-            normalize_advantage=args.normalize_advantage == "minibatch",
-        )
-        advantage = advantages.GAE(
-            critic,
-            gamma=args.gamma,
-            lmbda=args.lmbda,
-            average_gae=args.normalize_advantage == "rollout",
-            return_scale=scale,
-        )
-        parameters = [*actor.parameters(), *critic.parameters()]
+        env = args.make_env(args.num_envs, args.seed, args.workers)
+        with run.placed(args):
+            built = agent(args, env)
         update = updates.OnPolicyUpdate(
-            loss=loss,
-            advantage=advantage,
-            optimizer=torch.optim.Adam(parameters, lr=args.learning_rate, eps=1e-5),
+            loss=built.loss,
+            advantage=built.advantage,
+            optimizer=torch.optim.Adam(built.parameters(), lr=args.learning_rate, eps=1e-5),
             epochs=args.epochs,
             minibatch_size=args.minibatch_size,
             max_grad_norm=args.max_grad_norm,
@@ -121,21 +127,20 @@ def main(args: Args) -> None:
         )
         sizes = {"frames_per_batch": args.num_envs * args.steps, "total_frames": args.total_frames}
         if args.collector == "pgkit":
-            collector = collectors.VectorCollector(env, actor, **sizes, compile=args.compile)
+            collector = collectors.VectorCollector(env, built.actor, **sizes, compile=args.compile)
         else:
-            collector = collectors.TorchRLCollector(env, actor, **sizes)
+            collector = collectors.TorchRLCollector(env, built.actor, **sizes)
 
-        log.track(policy=actor, eval_env=partial(envs.make, args.env_id), update=update, collector=collector)
+        log.track(agent=built, eval_env=args.make_env, update=update, collector=collector)
         for rollout in collector:
-            loss.keep_distribution(rollout)
+            built.loss.keep_distribution(rollout)
             metrics = update(rollout)
-            penalty.update(loss.kl(rollout))
-            if normalizer is not None:
-                normalizer.update(rollout["observation"])
-            if scale is not None:
-                scale.update(rollout["value_target"])
-            compile_seconds = update.compile_seconds + collector.compile_seconds
-            log.step(collector.frames, rollout, metrics, compile_seconds=compile_seconds)
+            built.controller.update(built.loss.kl(rollout))
+            if built.normalizer is not None:
+                built.normalizer.update(rollout["observation"])
+            if built.scale is not None:
+                built.scale.update(rollout["value_target"])
+            log.step(collector.frames, rollout, metrics)
         collector.shutdown()
 
 

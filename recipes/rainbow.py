@@ -13,10 +13,11 @@ from functools import partial
 import torch
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
+from torchrl.envs import EnvBase
 from torchrl.modules import DistributionalQValueActor, NoisyLinear
 from torchrl.objectives import DistributionalDQNLoss
 
-from pgkit import collectors, controllers, data, envs, run, updates
+from pgkit import collectors, controllers, data, run, updates
 from pgkit.errors import UserError
 
 
@@ -28,43 +29,43 @@ class Args(run.RunArgs):
     """Gymnasium id with one discrete action."""
     num_envs: int = 4
     """Envs stepped side by side."""
-    steps: int = 1
+    steps: int = run.setting(1, low=1)
     """Steps each env takes between updates; the network's noise is drawn anew for each rollout."""
-    random_frames: int = 1_000
+    random_frames: int = run.setting(1_000, low=0)
     """Frames with random actions at the start; updates begin after them."""
-    batch_size: int = 64
+    batch_size: int = run.setting(64, low=1)
     """Rows of a batch."""
-    updates_per_step: float = 0.25
+    updates_per_step: float = run.setting(0.25, low=0)
     """Gradient steps for each frame."""
-    learning_rate: float = 5e-4
+    learning_rate: float = run.setting(5e-4, low=0)
     """Adam's step size."""
-    max_grad_norm: float | None = 10.0
+    max_grad_norm: float | None = run.setting(10.0, above=0)
     """Bound of the gradient's norm; None is none."""
-    gamma: float = 0.99
+    gamma: float = run.setting(0.99, low=0, high=1)
     """Discount."""
-    tau: float = 0.005
+    tau: float = run.setting(0.005, low=0, high=1)
     """Share of the network that its target takes over at each gradient step."""
-    atoms: int = 51
+    atoms: int = run.setting(51, low=1)
     """Values that the distribution of the return is spread over."""
     v_min: float = -10.0
     """The least of them."""
     v_max: float = 100.0
     """The largest of them: above any discounted return that is possible."""
-    noise: float = 0.5
+    noise: float = run.setting(0.5, low=0)
     """Initial standard deviation of the noisy weights."""
-    n_step: int = 3
+    n_step: int = run.setting(3, low=1)
     """Length of the returns that the network learns."""
-    priority_alpha: float = 0.5
+    priority_alpha: float = run.setting(0.5, low=0)
     """How much priorities count in the draws; 0 draws uniformly."""
-    priority_beta: float = 0.4
+    priority_beta: float = run.setting(0.4, low=0)
     """How far importance weights correct for that at the start; it rises to 1."""
-    buffer_size: int = 100_000
+    buffer_size: int = run.setting(100_000, low=1)
     """Frames that the replay buffer keeps."""
-    save_buffer: bool = False
+    save_buffer: bool = run.setting(False, on_resume=True)
     """Save the replay buffer beside each checkpoint, so that a resumed run goes on bit for bit."""
-    hidden: tuple[int, ...] = (128, 128)
+    hidden: tuple[int, ...] = run.setting((128, 128), low=1, high=2**16)
     """Sizes of the hidden layers; the last is a noisy one in each stream."""
-    log_every: int = 1_000
+    log_every: int = run.setting(1_000, low=1, on_resume=True)
     """A row of metrics every so many frames."""
 
 
@@ -93,36 +94,43 @@ class DuelingNoisyNet(nn.Module):
         advantage = self.advantage(x).unflatten(-1, self.sizes)
         return (self.value(x).unsqueeze(-1) + advantage - advantage.mean(-1, keepdim=True)).log_softmax(-2)
 
-    def draw_noise(self) -> None:
-        """Draws the noise of all weights anew; in evaluation mode there is none."""
-        for module in self.modules():
-            if isinstance(module, NoisyLinear):
-                module.reset_noise()
+
+def agent(args: Args, env: EnvBase) -> run.Agent:
+    """Network and loss."""
+    actions = getattr(env.action_spec_unbatched.space, "n", None)
+    if actions is None:
+        raise UserError(f"rainbow needs one discrete action, '{args.env_id}' has another action space: use sac")
+    if args.v_min >= args.v_max:
+        raise UserError(f"--v-min {args.v_min:g} --v-max {args.v_max:g}: give a least return below the largest")
+    sizes = (env.observation_spec_unbatched["observation"].shape[-1], actions)
+    net = DuelingNoisyNet(*sizes, args.atoms, args.hidden, args.noise)
+    actor = DistributionalQValueActor(
+        TensorDictModule(net, in_keys=["observation"], out_keys=["action_value"]),
+        support=torch.linspace(args.v_min, args.v_max, args.atoms),
+        action_space="categorical",
+    )
+    return run.Agent(actor, DistributionalDQNLoss(actor, gamma=args.gamma, delay_value=True))
+
+
+def draw_noise(actor: nn.Module) -> None:
+    """Draws the noise of all weights anew; in evaluation mode there is none."""
+    for module in actor.modules():
+        if isinstance(module, NoisyLinear):
+            module.reset_noise()
 
 
 def main(args: Args) -> None:
     """Trains, logs, evaluates, saves."""
     with run.Run(args, recipe="rainbow") as log:
-        make_env = partial(envs.make, args.env_id)
-        env = make_env(num_envs=args.num_envs, seed=args.seed, workers=args.workers)
-        actions = getattr(env.action_spec_unbatched.space, "n", None)
-        if actions is None:
-            raise UserError(f"rainbow needs one discrete action, '{args.env_id}' has another action space: use sac")
-        if args.v_min >= args.v_max:
-            raise UserError(f"--v-min {args.v_min:g} --v-max {args.v_max:g}: give a least return below the largest")
-        sizes = (env.observation_spec_unbatched["observation"].shape[-1], actions)
-        net = DuelingNoisyNet(*sizes, args.atoms, args.hidden, args.noise)
-        actor = DistributionalQValueActor(
-            TensorDictModule(net, in_keys=["observation"], out_keys=["action_value"]),
-            support=torch.linspace(args.v_min, args.v_max, args.atoms),
-            action_space="categorical",
-        )
+        env = args.make_env(args.num_envs, args.seed, args.workers)
+        with run.placed(args):
+            built = agent(args, env)
         sampler = data.Prioritized(args.priority_alpha, args.priority_beta)
         buffer = data.ReplayBuffer(env, args.buffer_size, n_steps=args.n_step, sampler=sampler)
         update = updates.OffPolicyUpdate(
-            loss=DistributionalDQNLoss(actor, gamma=args.gamma, delay_value=True),
+            loss=built.loss,
             buffer=buffer,
-            optimizer=torch.optim.Adam(actor.parameters(), lr=args.learning_rate, eps=1e-4),
+            optimizer=torch.optim.Adam(built.parameters(), lr=args.learning_rate, eps=1e-4),
             batch_size=args.batch_size,
             updates_per_step=args.updates_per_step,
             tau=args.tau,
@@ -133,7 +141,7 @@ def main(args: Args) -> None:
         )
         collector = collectors.VectorCollector(
             env,
-            actor,
+            built.actor,
             frames_per_batch=args.num_envs * args.steps,
             total_frames=args.total_frames,
             init_random_frames=args.random_frames,
@@ -141,14 +149,13 @@ def main(args: Args) -> None:
         )
 
         replay = data.BesideCheckpoint(buffer, log.dir / "checkpoints" / "buffer.pt", save=args.save_buffer)
-        log.track(policy=actor, eval_env=make_env, update=update, collector=collector, replay=replay)
+        log.track(agent=built, eval_env=args.make_env, update=update, collector=collector, replay=replay)
         beta = controllers.linear(args.priority_beta, 1.0)
         for rollout in collector:
-            net.draw_noise()
+            draw_noise(built.actor)
             sampler.set_beta(beta(collector.frames / args.total_frames))
             metrics = update(rollout)
-            compile_seconds = update.compile_seconds + collector.compile_seconds
-            log.step(collector.frames, rollout, metrics, compile_seconds=compile_seconds, every=args.log_every)
+            log.step(collector.frames, rollout, metrics, every=args.log_every)
         collector.shutdown()
 
 

@@ -13,9 +13,10 @@ from typing import Any, Literal
 
 import torch
 from torchrl.data import LazyTensorStorage
+from torchrl.envs import EnvBase
 from torchrl.modules import ProbabilisticActor
 
-from pgkit import collectors, controllers, data, envs, heads, losses, modules, run, updates
+from pgkit import collectors, controllers, data, heads, losses, modules, run, updates
 
 
 @dataclass
@@ -31,19 +32,19 @@ class Args(run.RunArgs):
     forward pass in place of target networks; with dropout and layer norm."""
     value_head: Literal["scalar", "quantile", "categorical"] = "scalar"
     """Critics learn the expected return, quantiles of the return, or the expected return as a classification."""
-    num_critics: int = 2
+    num_critics: int = run.setting(2, low=1)
     """Critics."""
     subset: int | None = None
     """Critics that make the target, drawn anew for each update; None: all."""
     actor_value: Literal["min", "mean"] = "min"
     """The actor maximizes the least of the critics, or their mean."""
-    dropout: float = 0.01
+    dropout: float = run.setting(0.01, low=0, high=0.99)
     """Probability of a zero in the hidden layers of a droq critic."""
-    atoms: int = 25
+    atoms: int = run.setting(25, low=1)
     """Quantiles of each critic."""
     drop_atoms: int = 2
     """Largest atoms left out of the target, for each critic."""
-    bins: int = 101
+    bins: int = run.setting(101, low=1)
     """Classes of a categorical critic."""
     value_range: tuple[float, float] = (-1_000.0, 1_000.0)
     """Least and largest discounted return of a categorical critic."""
@@ -53,53 +54,51 @@ class Args(run.RunArgs):
     """Envs stepped side by side."""
     threads: int = 2
     """Threads that PyTorch uses in this process; 2 is faster than 1 for networks 256 wide."""
-    action_repeat: int = 1
-    """Simulator steps for each action."""
-    steps: int = 16
+    steps: int = run.setting(16, low=1)
     """Steps each env takes before as many updates; 1 is the papers' schedule."""
     asynchronous: bool = False
     """Collect in another process while this one updates: rollouts are one update old, see train/policy_lag."""
-    random_frames: int = 1_000
+    random_frames: int = run.setting(1_000, low=0)
     """Frames with random actions before updates begin; a run no longer than that has a batch of them."""
-    batch_size: int = 256
+    batch_size: int = run.setting(256, low=1)
     """Rows of a batch."""
-    updates_per_step: float = 1.0
+    updates_per_step: float = run.setting(1.0, low=0)
     """Gradient steps for each frame."""
-    actor_delay: int = 1
+    actor_delay: int = run.setting(1, low=1)
     """The actor and the temperature learn at every so many-th gradient step."""
-    learning_rate: float = 3e-4
+    learning_rate: float = run.setting(3e-4, low=0)
     """Adam's step size for the actor."""
-    q_learning_rate: float = 3e-4
+    q_learning_rate: float = run.setting(3e-4, low=0)
     """Adam's step size for the critics."""
-    alpha_learning_rate: float = 3e-4
+    alpha_learning_rate: float = run.setting(3e-4, low=0)
     """Adam's step size for the temperature."""
-    beta1: float = 0.9
+    beta1: float = run.setting(0.9, low=0, high=0.9999)
     """Adam's first decay rate."""
-    gamma: float = 0.99
+    gamma: float = run.setting(0.99, low=0, high=1)
     """Discount."""
-    tau: float = 0.005
+    tau: float = run.setting(0.005, low=0, high=1)
     """Share of the critics that their targets take over at each gradient step."""
-    alpha: float | None = None
+    alpha: float | None = run.setting(None, low=0)
     """A fixed temperature; None trains it."""
-    alpha_init: float = 1.0
+    alpha_init: float = run.setting(1.0, low=1e-8)
     """The trained temperature at the start."""
     target_entropy: float | None = None
     """Entropy that the temperature holds, of actions scaled to [-1, 1]; None is minus the number of dimensions."""
-    buffer_size: int = 1_000_000
+    buffer_size: int = run.setting(1_000_000, low=1)
     """Frames that the replay buffer keeps."""
-    buffer_dir: Path | None = None
+    buffer_dir: Path | None = run.setting(None, on_resume=True)
     """Keep the replay buffer in files of this folder (a buffer beyond RAM); None keeps it in memory."""
-    n_step: int = 1
+    n_step: int = run.setting(1, low=1)
     """Length of the returns that the critics learn."""
     replay: Literal["uniform", "prioritized"] = "uniform"
     """Draw frames uniformly, or in proportion to the critics' errors."""
-    save_buffer: bool = False
+    save_buffer: bool = run.setting(False, on_resume=True)
     """Save the replay buffer beside each checkpoint, so that a resumed run goes on bit for bit."""
-    hidden: tuple[int, ...] = (256, 256)
+    hidden: tuple[int, ...] = run.setting((256, 256), low=1, high=2**16)
     """Sizes of the hidden layers; for simba, one residual block each, as wide as the last."""
-    critic_hidden: tuple[int, ...] | None = None
+    critic_hidden: tuple[int, ...] | None = run.setting(None, low=1, high=2**16)
     """Those of the critics; None: as the actor's."""
-    log_every: int = 1_000
+    log_every: int = run.setting(1_000, low=1, on_resume=True)
     """A row of metrics every so many frames."""
 
 
@@ -123,7 +122,7 @@ VARIANTS = {
 }  # fmt: skip
 
 
-def networks(args: Args, env: envs.VectorEnv) -> tuple[ProbabilisticActor, modules.QValue, Any]:
+def networks(args: Args, env: EnvBase) -> tuple[ProbabilisticActor, modules.QValue, Any]:
     """The actor, the critics, and what normalizes the observations of both."""
     bodies = {
         "simba": lambda sizes: partial(modules.simba, width=sizes[-1], blocks=len(sizes)),
@@ -146,33 +145,43 @@ def networks(args: Args, env: envs.VectorEnv) -> tuple[ProbabilisticActor, modul
     return actor, modules.q_value(env, args.num_critics, hidden, **layers, head=head, normalizer=normalizer), normalizer
 
 
+def agent(args: Args, env: EnvBase) -> run.Agent:
+    """Networks, temperature and loss."""
+    actor, critics, normalizer = networks(args, env)
+    if args.alpha is not None:
+        temperature = controllers.FixedTemperature(args.alpha)
+    else:
+        spec: Any = env.action_spec_unbatched
+        unit = ((spec.space.high - spec.space.low) / 2).log().sum().item()  # of actions' densities, against [-1, 1]
+        target_entropy = -spec.shape.numel() if args.target_entropy is None else args.target_entropy
+        temperature = controllers.Temperature(target_entropy + unit, args.alpha_init)
+    make_loss = losses.CrossQLoss if args.critic == "crossq" else losses.SACLoss
+    settings = {"subset": args.subset, "actor_value": args.actor_value, "gamma": args.gamma}
+    loss = make_loss(actor, critics, temperature=temperature, **settings)
+    return run.Agent(actor, loss, critics, normalizer=normalizer, controller=temperature)
+
+
 def main(args: Args) -> None:
     """Trains, logs, evaluates, saves."""
     with run.Run(args, recipe=args.variant or "sac") as log:
-        make_env = partial(envs.make, args.env_id, action_repeat=args.action_repeat)
-        env = make_env(num_envs=args.num_envs, seed=args.seed, workers=args.workers)
+        env = args.make_env(args.num_envs, args.seed, args.workers)
+        with run.placed(args):
+            built = agent(args, env)
         random_frames = args.random_frames if args.random_frames < args.total_frames else args.batch_size
-        actor, critics, normalizer = networks(args, env)
-        if args.alpha is not None:
-            temperature = controllers.FixedTemperature(args.alpha)
-        else:
-            spec: Any = env.action_spec_unbatched
-            unit = ((spec.space.high - spec.space.low) / 2).log().sum().item()  # of actions' densities, against [-1, 1]
-            target_entropy = -spec.shape.numel() if args.target_entropy is None else args.target_entropy
-            temperature = controllers.Temperature(target_entropy + unit, args.alpha_init)
-
-        sampler = data.Prioritized() if args.replay == "prioritized" else None
-        storage = data.in_files(args.buffer_dir) if args.buffer_dir else LazyTensorStorage
-        buffer = data.ReplayBuffer(env, args.buffer_size, n_steps=args.n_step, sampler=sampler, storage=storage)
+        buffer = data.ReplayBuffer(
+            env,
+            args.buffer_size,
+            n_steps=args.n_step,
+            sampler=data.Prioritized() if args.replay == "prioritized" else None,
+            storage=data.in_files(args.buffer_dir) if args.buffer_dir else LazyTensorStorage,
+        )
         groups = [
-            {"params": list(actor.parameters()), "lr": args.learning_rate},
-            {"params": list(critics.parameters()), "lr": args.q_learning_rate},
-            {"params": list(temperature.parameters()), "lr": args.alpha_learning_rate},
+            {"params": list(built.actor.parameters()), "lr": args.learning_rate},
+            {"params": list(built.critic.parameters()), "lr": args.q_learning_rate},
+            {"params": list(built.controller.parameters()), "lr": args.alpha_learning_rate},
         ]
-        make_loss = losses.CrossQLoss if args.critic == "crossq" else losses.SACLoss
-        settings = {"subset": args.subset, "actor_value": args.actor_value, "gamma": args.gamma}
         update = updates.OffPolicyUpdate(
-            loss=make_loss(actor, critics, temperature=temperature, **settings),
+            loss=built.loss,
             buffer=buffer,
             optimizer=torch.optim.Adam([g for g in groups if g["params"]], betas=(args.beta1, 0.999)),
             batch_size=args.batch_size,
@@ -186,7 +195,7 @@ def main(args: Args) -> None:
         make_collector = collectors.AsyncCollector if args.asynchronous else collectors.VectorCollector
         collector = make_collector(
             env,
-            actor,
+            built.actor,
             frames_per_batch=args.num_envs * args.steps,
             total_frames=args.total_frames,
             init_random_frames=random_frames,
@@ -194,15 +203,14 @@ def main(args: Args) -> None:
         )
 
         replay = data.BesideCheckpoint(buffer, log.dir / "checkpoints" / "buffer.pt", save=args.save_buffer)
-        log.track(policy=actor, eval_env=make_env, update=update, collector=collector, replay=replay)
+        log.track(agent=built, eval_env=args.make_env, update=update, collector=collector, replay=replay)
         for rollout in collector:
-            if normalizer is not None:
-                normalizer.update(rollout["observation"])
+            if built.normalizer is not None:
+                built.normalizer.update(rollout["observation"])
             metrics = update(rollout)
             if args.asynchronous:
                 metrics["policy_lag"] = collector.lag
-            compile_seconds = update.compile_seconds + collector.compile_seconds
-            log.step(collector.frames, rollout, metrics, compile_seconds=compile_seconds, every=args.log_every)
+            log.step(collector.frames, rollout, metrics, every=args.log_every)
         collector.shutdown()
 
 

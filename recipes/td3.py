@@ -6,14 +6,14 @@ The defaults are the MuJoCo settings; tuned values for other environments are in
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Literal
 
 import torch
 from torchrl.data import LazyTensorStorage
+from torchrl.envs import EnvBase
 
-from pgkit import collectors, data, envs, losses, modules, run, updates
+from pgkit import collectors, data, losses, modules, run, updates
 
 
 @dataclass
@@ -28,47 +28,45 @@ class Args(run.RunArgs):
     """Envs stepped side by side."""
     threads: int = 2
     """Threads that PyTorch uses in this process; 2 is faster than 1 for networks 256 wide."""
-    action_repeat: int = 1
-    """Simulator steps for each action."""
-    steps: int = 16
+    steps: int = run.setting(16, low=1)
     """Steps each env takes before as many updates; 1 is the papers' schedule."""
     asynchronous: bool = False
     """Collect in another process while this one updates: rollouts are one update old, see train/policy_lag."""
-    random_frames: int = 10_000
+    random_frames: int = run.setting(10_000, low=0)
     """Frames with random actions at the start; updates begin after them."""
-    exploration_noise: float = 0.1
+    exploration_noise: float = run.setting(0.1, low=0)
     """Standard deviation of the noise on collected actions, as a share of half the action's range."""
-    policy_noise: float = 0.2
+    policy_noise: float = run.setting(0.2, low=0)
     """Standard deviation of the noise on the targets' actions, as a share of half the action's range."""
-    noise_clip: float = 0.5
+    noise_clip: float = run.setting(0.5, low=0)
     """Bound of that noise, likewise."""
-    batch_size: int = 256
+    batch_size: int = run.setting(256, low=1)
     """Rows of a batch."""
-    updates_per_step: float = 1.0
+    updates_per_step: float = run.setting(1.0, low=0)
     """Gradient steps for each frame."""
-    actor_delay: int = 2
+    actor_delay: int = run.setting(2, low=1)
     """The actor learns, and the targets move, at every so many-th gradient step."""
-    learning_rate: float = 3e-4
+    learning_rate: float = run.setting(3e-4, low=0)
     """Adam's step size for the actor."""
-    q_learning_rate: float = 3e-4
+    q_learning_rate: float = run.setting(3e-4, low=0)
     """Adam's step size for the critics."""
-    gamma: float = 0.99
+    gamma: float = run.setting(0.99, low=0, high=1)
     """Discount."""
-    tau: float = 0.005
+    tau: float = run.setting(0.005, low=0, high=1)
     """Share of the trained networks that their targets take over when they move."""
-    buffer_size: int = 1_000_000
+    buffer_size: int = run.setting(1_000_000, low=1)
     """Frames that the replay buffer keeps."""
-    buffer_dir: Path | None = None
+    buffer_dir: Path | None = run.setting(None, on_resume=True)
     """Keep the replay buffer in files of this folder (a buffer beyond RAM); None keeps it in memory."""
-    n_step: int = 1
+    n_step: int = run.setting(1, low=1)
     """Length of the returns that the critics learn."""
     replay: Literal["uniform", "prioritized"] = "uniform"
     """Draw frames uniformly, or in proportion to the critics' errors."""
-    save_buffer: bool = False
+    save_buffer: bool = run.setting(False, on_resume=True)
     """Save the replay buffer beside each checkpoint, so that a resumed run goes on bit for bit."""
-    hidden: tuple[int, ...] = (256, 256)
+    hidden: tuple[int, ...] = run.setting((256, 256), low=1, high=2**16)
     """Sizes of the hidden layers, of actor and critics alike."""
-    log_every: int = 1_000
+    log_every: int = run.setting(1_000, low=1, on_resume=True)
     """A row of metrics every so many frames."""
 
 
@@ -81,15 +79,28 @@ PRESETS = {
 }
 
 
+def agent(args: Args, env: EnvBase) -> run.Agent:
+    """Networks, loss and exploration."""
+    actor = modules.deterministic_actor(env, args.hidden)
+    critics = modules.q_value(env, num_critics=2, hidden=args.hidden)
+    explorer = modules.GaussianExploration(actor, env, args.exploration_noise)
+    loss = losses.TD3Loss(
+        actor,
+        critics,
+        action_spec=env.action_spec_unbatched,
+        policy_noise=args.policy_noise * explorer.bounds.half_range,
+        noise_clip=args.noise_clip * explorer.bounds.half_range,
+        gamma=args.gamma,
+    )
+    return run.Agent(actor, loss, critics, explorer=explorer)
+
+
 def main(args: Args) -> None:
     """Trains, logs, evaluates, saves."""
     with run.Run(args, recipe="td3") as log:
-        make_env = partial(envs.make, args.env_id, action_repeat=args.action_repeat)
-        env = make_env(num_envs=args.num_envs, seed=args.seed, workers=args.workers)
-        actor = modules.deterministic_actor(env, args.hidden)
-        critics = modules.q_value(env, num_critics=2, hidden=args.hidden)
-        exploring = modules.GaussianExploration(actor, env, args.exploration_noise)
-
+        env = args.make_env(args.num_envs, args.seed, args.workers)
+        with run.placed(args):
+            built = agent(args, env)
         buffer = data.ReplayBuffer(
             env,
             args.buffer_size,
@@ -98,18 +109,11 @@ def main(args: Args) -> None:
             storage=data.in_files(args.buffer_dir) if args.buffer_dir else LazyTensorStorage,
         )
         groups = [
-            {"params": list(actor.parameters()), "lr": args.learning_rate},
-            {"params": list(critics.parameters()), "lr": args.q_learning_rate},
+            {"params": list(built.actor.parameters()), "lr": args.learning_rate},
+            {"params": list(built.critic.parameters()), "lr": args.q_learning_rate},
         ]
         update = updates.OffPolicyUpdate(
-            loss=losses.TD3Loss(
-                actor,
-                critics,
-                action_spec=env.action_spec_unbatched,
-                policy_noise=args.policy_noise * exploring.bounds.half_range,
-                noise_clip=args.noise_clip * exploring.bounds.half_range,
-                gamma=args.gamma,
-            ),
+            loss=built.loss,
             buffer=buffer,
             optimizer=torch.optim.Adam(groups),
             batch_size=args.batch_size,
@@ -124,7 +128,7 @@ def main(args: Args) -> None:
         make_collector = collectors.AsyncCollector if args.asynchronous else collectors.VectorCollector
         collector = make_collector(
             env,
-            exploring,
+            built.explorer,
             frames_per_batch=args.num_envs * args.steps,
             total_frames=args.total_frames,
             init_random_frames=args.random_frames,
@@ -132,13 +136,12 @@ def main(args: Args) -> None:
         )
 
         replay = data.BesideCheckpoint(buffer, log.dir / "checkpoints" / "buffer.pt", save=args.save_buffer)
-        log.track(policy=actor, eval_env=make_env, update=update, collector=collector, replay=replay)
+        log.track(agent=built, eval_env=args.make_env, update=update, collector=collector, replay=replay)
         for rollout in collector:
             metrics = update(rollout)
             if args.asynchronous:
                 metrics["policy_lag"] = collector.lag
-            compile_seconds = update.compile_seconds + collector.compile_seconds
-            log.step(collector.frames, rollout, metrics, compile_seconds=compile_seconds, every=args.log_every)
+            log.step(collector.frames, rollout, metrics, every=args.log_every)
         collector.shutdown()
 
 

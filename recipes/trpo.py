@@ -6,12 +6,12 @@ The defaults are the MuJoCo settings; tuned values for other environments are in
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 from typing import Literal
 
 import torch
+from torchrl.envs import EnvBase
 
-from pgkit import advantages, collectors, envs, losses, modules, run, updates
+from pgkit import advantages, collectors, losses, modules, run, updates
 
 
 @dataclass
@@ -24,27 +24,27 @@ class Args(run.RunArgs):
     """Env steps to train for, all envs together."""
     eval_every: int = 100_000
     """Evaluate and save a checkpoint every so many frames; 0 = only at the end."""
-    steps: int = 256
+    steps: int = run.setting(256, low=1)
     """Steps each env takes for one rollout."""
-    max_kl: float = 0.01
+    max_kl: float = run.setting(0.01, low=0)
     """Bound of the mean KL divergence of a step."""
     natural_gradient: bool = False
     """Take the full step without a line search: the natural policy gradient."""
-    cg_steps: int = 10
+    cg_steps: int = run.setting(10, low=1)
     """Steps of conjugate gradients toward the natural gradient."""
-    damping: float = 0.1
+    damping: float = run.setting(0.1, low=0)
     """Added to the diagonal of the Fisher matrix."""
-    backtracks: int = 10
+    backtracks: int = run.setting(10, low=0)
     """Shorter steps that the line search tries, each 0.8 times the one before."""
-    critic_epochs: int = 10
+    critic_epochs: int = run.setting(10, low=1)
     """Passes of the critic over a rollout."""
-    minibatch_size: int = 64
+    minibatch_size: int = run.setting(64, low=1)
     """Rows of a minibatch of the critic."""
-    learning_rate: float = 1e-3
+    learning_rate: float = run.setting(1e-3, low=0)
     """Adam's step size, for the critic."""
-    gamma: float = 0.99
+    gamma: float = run.setting(0.99, low=0, high=1)
     """Discount."""
-    lmbda: float = 0.95
+    lmbda: float = run.setting(0.95, low=0, high=1)
     """GAE's lambda."""
     entropy_coeff: float = 0.0
     """Weight of the entropy bonus."""
@@ -52,7 +52,7 @@ class Args(run.RunArgs):
     """Normalize observations by their running mean and deviation."""
     scale_returns: bool = True
     """Let the critic learn returns divided by their running deviation; rewards stay as they are."""
-    hidden: tuple[int, ...] = (64, 64)
+    hidden: tuple[int, ...] = run.setting((64, 64), low=1, high=2**16)
     """Sizes of the hidden layers, of actor and critic alike."""
     log_std: float = -0.5
     """Initial log standard deviation of a continuous policy."""
@@ -71,31 +71,38 @@ PRESETS = {
 }  # fmt: skip
 
 
+def agent(args: Args, env: EnvBase) -> run.Agent:
+    """Networks, loss and advantage."""
+    normalizer = modules.ObsNormalizer(env) if args.normalize_obs else None
+    scale = modules.ReturnScale() if args.scale_returns else None
+
+    if env.action_spec.dtype.is_floating_point:
+        actor = modules.gaussian_actor(env, args.hidden, log_std=args.log_std, normalizer=normalizer)
+    else:
+        actor = modules.categorical_actor(env, args.hidden, normalizer=normalizer)
+    critic = modules.state_value(env, args.hidden, normalizer=normalizer)
+
+    loss = losses.TRPOLoss(actor, critic, entropy_coeff=args.entropy_coeff)
+    advantage = advantages.GAE(
+        critic,
+        gamma=args.gamma,
+        lmbda=args.lmbda,
+        average_gae=True,
+        return_scale=scale,
+    )
+    return run.Agent(actor, loss, critic, advantage, normalizer=normalizer, scale=scale)
+
+
 def main(args: Args) -> None:
     """Trains, logs, evaluates, saves."""
     with run.Run(args, recipe="trpo") as log:
-        env = envs.make(args.env_id, num_envs=args.num_envs, seed=args.seed, workers=args.workers)
-        normalizer = modules.ObsNormalizer(env) if args.normalize_obs else None
-        scale = modules.ReturnScale() if args.scale_returns else None
-
-        if env.action_spec.dtype.is_floating_point:
-            actor = modules.gaussian_actor(env, args.hidden, log_std=args.log_std, normalizer=normalizer)
-        else:
-            actor = modules.categorical_actor(env, args.hidden, normalizer=normalizer)
-        critic = modules.state_value(env, args.hidden, normalizer=normalizer)
-
-        loss = losses.TRPOLoss(actor, critic, entropy_coeff=args.entropy_coeff)
-        advantage = advantages.GAE(
-            critic,
-            gamma=args.gamma,
-            lmbda=args.lmbda,
-            average_gae=True,
-            return_scale=scale,
-        )
+        env = args.make_env(args.num_envs, args.seed, args.workers)
+        with run.placed(args):
+            built = agent(args, env)
         update = updates.TrustRegionUpdate(
-            loss=loss,
-            advantage=advantage,
-            optimizer=torch.optim.Adam(critic.parameters(), lr=args.learning_rate),
+            loss=built.loss,
+            advantage=built.advantage,
+            optimizer=torch.optim.Adam(built.critic.parameters(), lr=args.learning_rate),
             max_kl=args.max_kl,
             line_search=not args.natural_gradient,
             cg_steps=args.cg_steps,
@@ -108,19 +115,18 @@ def main(args: Args) -> None:
         )
         sizes = {"frames_per_batch": args.num_envs * args.steps, "total_frames": args.total_frames}
         if args.collector == "pgkit":
-            collector = collectors.VectorCollector(env, actor, **sizes, compile=args.compile)
+            collector = collectors.VectorCollector(env, built.actor, **sizes, compile=args.compile)
         else:
-            collector = collectors.TorchRLCollector(env, actor, **sizes)
+            collector = collectors.TorchRLCollector(env, built.actor, **sizes)
 
-        log.track(policy=actor, eval_env=partial(envs.make, args.env_id), update=update, collector=collector)
+        log.track(agent=built, eval_env=args.make_env, update=update, collector=collector)
         for rollout in collector:
             metrics = update(rollout)
-            if normalizer is not None:
-                normalizer.update(rollout["observation"])
-            if scale is not None:
-                scale.update(rollout["value_target"])
-            compile_seconds = update.compile_seconds + collector.compile_seconds
-            log.step(collector.frames, rollout, metrics, compile_seconds=compile_seconds)
+            if built.normalizer is not None:
+                built.normalizer.update(rollout["observation"])
+            if built.scale is not None:
+                built.scale.update(rollout["value_target"])
+            log.step(collector.frames, rollout, metrics)
         collector.shutdown()
 
 

@@ -4,6 +4,7 @@ from pgkit.advantages.base import Advantage
 from pgkit.advantages.gae import GAE
 from pgkit.advantages.group_relative import GroupRelative
 from pgkit.advantages.td_lambda import MonteCarlo, NStep, TDLambda
+from pgkit.advantages.token_gae import TokenGAE
 from pgkit.advantages.vtrace import VTrace
 
-__all__ = ["GAE", "Advantage", "GroupRelative", "MonteCarlo", "NStep", "TDLambda", "VTrace"]
+__all__ = ["GAE", "Advantage", "GroupRelative", "MonteCarlo", "NStep", "TDLambda", "TokenGAE", "VTrace"]

@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor
 
 from pgkit.advantages.base import Advantage
-from pgkit.errors import whole, within
+from pgkit.errors import check_whole_number, within
 from pgkit.functional import from_start, lambda_return, n_step_return
 
 
@@ -64,7 +64,7 @@ class NStep(Advantage):
         return_scale: Any = None,
     ) -> None:
         super().__init__(critic, gamma=gamma, standardize=standardize, per_agent=per_agent, return_scale=return_scale)
-        whole(1, steps=steps)
+        check_whole_number(1, steps=steps)
         self.steps = steps
 
     def estimate(self, value: Tensor, next_value: Tensor, rollout: TensorDictBase) -> tuple[Tensor, Tensor]:

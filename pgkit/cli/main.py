@@ -1,16 +1,15 @@
 """``pgkit ls / cp / run / eval / plot``. Heavy imports wait until a command needs them."""
 
 import argparse
-import os
-import shutil
+import runpy
 import sys
-import types
 from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import NoReturn
 
 from pgkit.cli import recipes, studies
+from pgkit.cli.exits import exits
 from pgkit.errors import UserError
 
 
@@ -22,18 +21,13 @@ class Parser(argparse.ArgumentParser):
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Run one command: exit 2 and one line on a user's error, 130 on Ctrl-C."""
-    try:
+    """Run one command: exit 2 and one line on a user's error, 3 on divergence, 130 on Ctrl-C."""
+    with exits():
         args, flags = parser().parse_known_args(argv)
         if flags and not getattr(args, "takes_flags", False):
             raise UserError(f"unrecognized arguments: {' '.join(flags)} (see pgkit --help)")
         args.flags = flags or getattr(args, "flags", [])
         args.command(args)
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
-    except KeyboardInterrupt:
-        sys.exit(130)
 
 
 def parser() -> Parser:
@@ -60,6 +54,7 @@ def parser() -> Parser:
     command.add_argument("--episodes", type=positive, default=10, help="how many (default: 10)")
     command.add_argument("--seed", type=int, default=0, help="of the envs (default: 0)")
     command.add_argument("--which", choices=["best", "latest"], default="best", help="checkpoint (default: best)")
+    command.add_argument("--trust", action="store_true", help="run the recipe file and import what RUN_DIR names")
     command.set_defaults(command=evaluate_run)
 
     command = commands.add_parser("plot", help="draw the learning curves of runs; seeds are averaged")
@@ -105,31 +100,38 @@ def copy_recipe(args: argparse.Namespace) -> None:
         target = target / source.name
     if target.suffix != ".py":
         raise UserError(f"{target} is no name for a recipe: give one that ends in .py")
-    if target.exists():
-        raise UserError(f"{target} exists and is not overwritten; give another name")
     if not target.parent.is_dir():
         raise UserError(f"no directory {target.parent} to copy into")
-    shutil.copyfile(source, target)
+    try:
+        with target.open("xb") as file:  # exclusive: a link that waits there is not followed
+            file.write(source.read_bytes())
+    except FileExistsError:
+        raise UserError(f"{target} exists and is not overwritten; give another name") from None
+    except OSError as error:
+        raise UserError(f"{target} cannot be written: {error.strerror}") from error
     variant = f" --variant {args.recipe}" if args.recipe in recipes.variants() else ""
     print(f"copied to {target}; train with: pgkit run {target}{variant}")
 
 
 def run_recipe(args: argparse.Namespace) -> None:
     path = recipes.find(args.recipe)
+    if not recipes.is_shipped(path):  # as `python FILE` runs it; its folder comes last, so that it hides no module
+        sys.argv = [args.recipe, *args.flags]
+        sys.path.append(str(path.resolve().parent))
+        runpy.run_path(str(path), run_name="__main__")
+        return
+    recipe = recipes.load(path)
     variant = ["--variant", args.recipe] if args.recipe in recipes.variants() else []
-    sys.argv = [args.recipe, *variant, *args.flags]
-    sys.path[:0] = [str(path.resolve().parent), os.getcwd()]  # --env-id module:Id finds modules here
-    script = types.ModuleType("__main__")  # as runpy.run_path does it, but argv[0] stays what the user typed
-    script.__file__ = str(path.resolve())
-    sys.modules["__main__"] = script
-    exec(compile(path.read_bytes(), script.__file__, "exec"), script.__dict__)
+    from pgkit import run
+
+    settings = {name.lower(): vars(recipe).get(name) for name in ("PRESETS", "VARIANTS")}
+    run.launch(recipe.main, recipe.Args, argv=[*variant, *args.flags], **settings)
 
 
 def evaluate_run(args: argparse.Namespace) -> None:
     from pgkit import run
 
-    sys.path.insert(0, os.getcwd())
-    policy = run.load_policy(args.run_dir, args.which)
+    policy = run.load_policy(args.run_dir, args.which, trust=args.trust)
     env = policy.make_env(num_envs=min(args.episodes, 10), seed=args.seed)
     try:
         scores = run.evaluate(policy.actor, env, args.episodes)
@@ -144,5 +146,4 @@ def plot_runs(args: argparse.Namespace) -> None:
     from pgkit import run
 
     out = args.out or (args.run_dirs[0] / "curve.png" if len(args.run_dirs) == 1 else Path("curves.png"))
-    run.plot(args.run_dirs, out, args.x)
-    print(f"wrote {out}")
+    print(f"wrote {run.plot(args.run_dirs, out, args.x)}")

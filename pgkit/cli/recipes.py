@@ -2,7 +2,10 @@
 
 import ast
 import difflib
+import importlib.util
+import sys
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from pgkit.errors import UserError
@@ -13,6 +16,11 @@ def recipes_dir() -> Path:
     package = Path(__file__).resolve().parent.parent
     inside = package / "recipes"
     return inside if inside.is_dir() else package.parent / "recipes"
+
+
+def is_shipped(file: Path) -> bool:
+    """Whether it is one of the shipped recipes."""
+    return file.resolve().parent == recipes_dir().resolve()
 
 
 def names() -> list[str]:
@@ -58,3 +66,36 @@ def find(recipe: str) -> Path:
         close = ", ".join(difflib.get_close_matches(recipe, known, cutoff=0.3) or known)
         raise UserError(f"no recipe named {recipe}; nearest: {close} (pgkit ls lists all; a file ends in .py)")
     return recipes_dir() / f"{recipe}.py"
+
+
+def load(path: Path) -> ModuleType:
+    """The recipe in this file, imported.
+
+    Raises:
+        UserError: it has no ``main`` and ``Args``.
+    """
+    path = path.resolve()
+    if str(path.parent) not in sys.path:
+        sys.path.append(str(path.parent))  # worker processes import it by its name; last, it hides no other module
+    name = path.stem if _own_name(path) else f"{path.stem}_recipe"
+    spec: Any = importlib.util.spec_from_file_location(name, path)
+    module = sys.modules[name] = importlib.util.module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+    except BaseException:
+        del sys.modules[name]
+        raise
+    if missing := [x for x in ("main", "Args") if x not in vars(module)]:
+        raise UserError(
+            f"{path} has no {' and no '.join(missing)}: a recipe has a class Args and a function main(args)"
+        )
+    return module
+
+
+def _own_name(path: Path) -> bool:
+    """Whether no other module has the name of this file."""
+    try:
+        spec = importlib.util.find_spec(path.stem)
+    except (ValueError, ImportError):  # half a module, or a name with a dot
+        return False
+    return spec is None or spec.origin == str(path)

@@ -1,7 +1,8 @@
 """Collectors: iterables of rollouts."""
 
 from pgkit.collectors.asynchronous import AsyncCollector
+from pgkit.collectors.tokens import TokenCollector
 from pgkit.collectors.torchrl import TorchRLCollector
 from pgkit.collectors.vector import VectorCollector
 
-__all__ = ["AsyncCollector", "TorchRLCollector", "VectorCollector"]
+__all__ = ["AsyncCollector", "TokenCollector", "TorchRLCollector", "VectorCollector"]

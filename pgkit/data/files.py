@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import atexit
-import os
 import shutil
 import tempfile
 from collections.abc import Callable
@@ -12,10 +11,10 @@ from logging import getLogger
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import torch
 from torchrl.data import LazyMemmapStorage
 from torchrl.data.replay_buffers import TensorStorage
 
+from pgkit import files
 from pgkit.errors import UserError
 
 if TYPE_CHECKING:
@@ -65,16 +64,14 @@ def restore(buffer: ReplayBuffer, saved: dict[str, Any]) -> None:
 def save(buffer: ReplayBuffer, path: Path) -> None:
     """Writes the state to ``path``: a crash leaves the old file or the new one."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(path.name + ".tmp")
-    torch.save(state(buffer), temporary)
-    os.replace(temporary, path)
+    files.save(path, state(buffer))
 
 
 def load(buffer: ReplayBuffer, path: Path) -> None:
     """Reads what :func:`save` wrote."""
     if not path.is_file():
         raise UserError(f"there is no saved replay buffer at {path}")
-    restore(buffer, torch.load(path, weights_only=True))
+    restore(buffer, files.load(path))
 
 
 def in_files(folder: str | Path) -> Callable[[int], TensorStorage]:

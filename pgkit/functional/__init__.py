@@ -12,7 +12,7 @@ from pgkit.functional.distributional import (
     quantile_huber,
     two_hot,
 )
-from pgkit.functional.group_relative import group_relative
+from pgkit.functional.group_relative import batch_relative, group_relative, has_spread, leave_one_out
 from pgkit.functional.images import quantized_pixels, shift_images
 from pgkit.functional.returns import discounted_sum, generalized_advantage
 from pgkit.functional.smoothing import smoothed_action
@@ -34,12 +34,14 @@ from pgkit.functional.surrogates import (
     rollback_surrogate,
 )
 from pgkit.functional.td_lambda import from_start, lambda_return, n_step_return
+from pgkit.functional.tokens import kl_estimate, sequence_log_ratio, token_weights
 from pgkit.functional.values import clipped_value_loss, explained_variance, standardize, value_loss
 from pgkit.functional.vtrace import vtrace
 
 __all__ = [
     "adapted_coefficient",
     "approx_kl",
+    "batch_relative",
     "bootstrap_target",
     "categorical_mean",
     "categorical_projection",
@@ -55,9 +57,12 @@ __all__ = [
     "from_start",
     "generalized_advantage",
     "group_relative",
+    "has_spread",
     "hl_gauss",
     "is_flag",
+    "kl_estimate",
     "lambda_return",
+    "leave_one_out",
     "listed",
     "n_step_return",
     "policy_gradient",
@@ -68,12 +73,14 @@ __all__ = [
     "ratio_surrogate",
     "rollback_surrogate",
     "same_shape",
+    "sequence_log_ratio",
     "shift_images",
     "smoothed_action",
     "soft_returns",
     "standardize",
     "straight_through_sample",
     "temperature_loss",
+    "token_weights",
     "twin_minimum",
     "two_hot",
     "value_loss",

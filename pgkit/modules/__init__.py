@@ -3,16 +3,19 @@
 from pgkit.modules.actors import actor, gaussian_actor, tanh_normal_actor
 from pgkit.modules.augmentations import random_shift
 from pgkit.modules.bodies import Encoder, batch_renorm_mlp, ensemble_mlp, simba
+from pgkit.modules.causal_lm import causal_lm, token_value
 from pgkit.modules.convolutions import ConvEncoder, Detached, conv_encoder, decoder
 from pgkit.modules.deterministic import deterministic_actor
 from pgkit.modules.discrete import categorical_actor
 from pgkit.modules.encoders import dict_encoder
 from pgkit.modules.ensemble import EnsembleBatchRenorm, EnsembleDropout, EnsembleLayerNorm, EnsembleLinear
 from pgkit.modules.exploration import GaussianExploration, OrnsteinUhlenbeck
+from pgkit.modules.hugging_face import hugging_face, hugging_face_tokenizer
 from pgkit.modules.mlp import mlp
 from pgkit.modules.normalizers import ObsNormalizer, ReturnScale
 from pgkit.modules.q_values import QValue, discrete_q_value, q_value
 from pgkit.modules.recurrent import gru, lstm
+from pgkit.modules.tokens import TokenActor, TokenDistribution, TokenPolicy, TokenValue
 from pgkit.modules.values import state_value
 
 __all__ = [
@@ -28,9 +31,14 @@ __all__ = [
     "OrnsteinUhlenbeck",
     "QValue",
     "ReturnScale",
+    "TokenActor",
+    "TokenDistribution",
+    "TokenPolicy",
+    "TokenValue",
     "actor",
     "batch_renorm_mlp",
     "categorical_actor",
+    "causal_lm",
     "conv_encoder",
     "decoder",
     "deterministic_actor",
@@ -39,6 +47,8 @@ __all__ = [
     "ensemble_mlp",
     "gaussian_actor",
     "gru",
+    "hugging_face",
+    "hugging_face_tokenizer",
     "lstm",
     "mlp",
     "q_value",
@@ -46,4 +56,5 @@ __all__ = [
     "simba",
     "state_value",
     "tanh_normal_actor",
+    "token_value",
 ]

@@ -1,48 +1,45 @@
-"""Checkpoints: everything that a resumed run needs to go on bit for bit, each file replaced in one step."""
+"""Checkpoints: everything that a resumed run needs to go on bit for bit."""
 
-import os
-import pickle
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
-import cloudpickle
 import torch
+from torch import nn
 
+from pgkit import files
 from pgkit.errors import UserError
+from pgkit.seams import Stateful
+
+_KINDS = {"recipe": str, "frames": int, "states": dict, "rng": dict, "counters": dict}
 
 
-class Stateful(Protocol):
-    """What a run can save and restore."""
-
-    def state_dict(self) -> dict[str, Any]: ...
-
-    def load_state_dict(self, state_dict: Any, /) -> Any: ...
-
-
-def save(path: Path, content: Any) -> None:
-    """Write ``content`` to ``path`` in one step: a crash leaves the old file or the new one, never half.
-
-    Classes defined in the recipe itself are saved by value, so the file opens without the recipe.
-    """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(path.name + ".tmp")
-    torch.save(content, temporary, pickle_module=cloudpickle)
-    os.replace(temporary, path)
-
-
-def load(path: Path) -> Any:
-    """What ``save`` wrote, on the CPU. It unpickles: open only run directories that you trust."""
+def load(path: Path) -> dict[str, Any]:
+    """What ``files.save`` wrote; a UserError if it is not there or damaged, with a checkpoint that is whole."""
     if not path.is_file():
         raise UserError(f"{path.parent.parent} has no checkpoint {path.name}: nothing was saved there yet")
     try:
-        return torch.load(path, map_location="cpu", weights_only=False)
-    except (ImportError, AttributeError) as error:
-        raise UserError(
-            f"{path} needs code that is not found ({error}): run this where the recipe's own modules are, or put their "
-            "folder on PYTHONPATH"
-        ) from error
-    except (RuntimeError, EOFError, OSError, pickle.UnpicklingError) as error:
-        raise UserError(f"{path} is damaged: {str(error).splitlines()[0]}") from error
+        saved = files.load(path)
+    except UserError as error:
+        other = path.with_name("latest.pt" if path.stem == "best" else "best.pt")
+        if not files.is_whole(other):
+            raise
+        raise UserError(f"{error}; {other} is whole: --resume {other}, --which {other.stem}") from error
+    if not isinstance(saved, dict) or any(not isinstance(saved.get(key), kind) for key, kind in _KINDS.items()):
+        raise UserError(f"{path} is damaged: it is no checkpoint")
+    return saved
+
+
+@contextlib.contextmanager
+def damage(run_dir: Path) -> Iterator[None]:
+    """A UserError in place of what a checkpoint of another structure raises."""
+    try:
+        yield
+    except (KeyError, TypeError, ValueError, RuntimeError, AttributeError, OverflowError) as error:
+        raise UserError(f"the checkpoint of {run_dir} is damaged: {str(error).splitlines()[0]}") from error
 
 
 def restore(tracked: dict[str, Stateful], states: dict[str, Any], where: Path) -> None:
@@ -55,9 +52,17 @@ def restore(tracked: dict[str, Stateful], states: dict[str, Any], where: Path) -
     for name, owner in tracked.items():
         try:
             owner.load_state_dict(states[name])
-        except (RuntimeError, KeyError, IndexError, ValueError) as error:
-            reason = str(error).strip().splitlines()[-1].strip()
+        except UserError:
+            raise
+        except (RuntimeError, KeyError, IndexError, ValueError, TypeError, AttributeError) as error:
+            reason = (str(error).strip() or "no reason given").splitlines()[-1].strip()
             raise UserError(
                 f"{where}: the state of {name} does not fit what the recipe built: networks and optimizers keep their "
                 f"settings on a resume ({reason})"
             ) from error
+
+
+def finite(module: nn.Module) -> bool:
+    """Whether every weight is finite, and no buffer has a NaN."""
+    weights = all(bool(torch.isfinite(p).all()) for p in module.parameters())
+    return weights and not any(bool(b.isnan().any()) for b in module.buffers() if b.is_floating_point())

@@ -1,36 +1,53 @@
-"""A run's directory and its ``config.json``."""
+"""A run's directory: which one, whose it is, and what is taken away again."""
 
-import dataclasses
-import json
-import math
+from __future__ import annotations
+
 import os
-import platform
-import subprocess
-import sys
 import time
-from importlib import metadata
 from pathlib import Path
-from typing import Any
 
 from pgkit.errors import UserError
-from pgkit.run.settings import RunArgs, read_json
-
-PACKAGES = ("pgkit", "torch", "torchrl", "tensordict", "numpy", "gymnasium", "mujoco", "dm-control", "shimmy")
+from pgkit.run.args import RunArgs, free_on_resume
+from pgkit.run.config import read_config, saved_args
 
 
 def choose(args: RunArgs, recipe: str) -> Path:
-    """The directory that the settings ask for; a UserError if it already holds a run. Writes nothing."""
+    """The directory that the settings ask for; a UserError if it already holds a run. Writes nothing.
+
+    What a run of the same settings left behind that ended before its first checkpoint does not count.
+    """
+    if args.resume_if_possible and args.run_dir is None:
+        raise UserError("--resume-if-possible needs a --run-dir to look into")
+    if args.resume_if_possible and not args.resume and args.run_dir and can_resume(args.run_dir):
+        args.resume = args.run_dir
     if args.resume:
-        return Path(args.resume)
-    name = f"{args.env_id.replace('/', '-')}__{recipe}__{args.seed}__{time.strftime('%Y%m%d-%H%M%S')}"
+        return run_of(Path(args.resume))
+    name = f"{args.env_id.replace('/', '-')[:100]}__{recipe}__{args.seed}__{time.strftime('%Y%m%d-%H%M%S')}"
     path = Path(args.run_dir or Path("runs") / name)
-    if path.exists() and not path.is_dir():
-        raise UserError(f"--run-dir {path} is a file; give a directory")
-    if holds_run(path):
-        saved = (path / "checkpoints" / "latest.pt").exists()
-        way = f"or go on with it by --resume {path}" if saved else "or delete it: it has no checkpoint to go on from"
+    try:
+        if path.exists() and not path.is_dir():
+            raise UserError(f"--run-dir {path} is a file; give a directory")
+        held = holds_run(path)
+    except OSError as error:
+        raise UserError(f"--run-dir {path!s:.80}...: {error.strerror}") from error
+    if held and not _can_start_over(path, args, recipe):
+        way = (
+            f"or go on with it by --resume {path}"
+            if can_resume(path)
+            else "or delete it: it has no checkpoint to go on from"
+        )
         raise UserError(f"{path} already holds a run: give another --run-dir, {way}")
     return path
+
+
+def run_of(path: Path) -> Path:
+    """The run directory of ``--resume``, which takes one of its checkpoints, too."""
+    return path.parent.parent if path.suffix == ".pt" and path.parent.name == "checkpoints" else path
+
+
+def can_resume(path: Path) -> bool:
+    """Whether a checkpoint is there to go on from."""
+    return (path / "checkpoints" / "latest.pt").exists()
 
 
 def holds_run(path: Path) -> bool:
@@ -38,29 +55,14 @@ def holds_run(path: Path) -> bool:
     return any((path / name).exists() for name in ("config.json", "metrics.csv", "checkpoints"))
 
 
-def write_config(path: Path, args: RunArgs, recipe: str, resumed_at: list[int]) -> None:
-    """Write ``config.json``: recipe, resolved settings, versions, git revision, frames at each resume.
-
-    A new run claims the directory by creating the file; if another run got there first this is a UserError.
-    """
-    config = {
-        "recipe": recipe,
-        "settings": dataclasses.asdict(args) | {"run_dir": path, "resume": None},
-        "command": read_config(path)["command"] if resumed_at else sys.argv,
-        "versions": versions(),
-        "git_revision": git_revision(),
-        "resumed_at": resumed_at,
-    }
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(f"--run-dir {path} cannot be made: {error.strerror}") from error
-    if not resumed_at:
-        try:
-            (path / "config.json").touch(exist_ok=False)
-        except FileExistsError:
-            raise UserError(f"{path} already holds a run: give another --run-dir") from None
-    write_json(path / "config.json", config)
+def _can_start_over(path: Path, args: RunArgs, recipe: str) -> bool:
+    """Whether the directory holds a run of this recipe and these settings that has saved nothing."""
+    if any((path / "checkpoints").glob("*.pt")) or not (path / "config.json").exists():
+        return False
+    if read_config(path).get("file") is None and read_config(path)["recipe"] != recipe:
+        return False
+    saved, free = saved_args(type(args), path), {*free_on_resume(type(args)), "run_dir"}
+    return all(value == getattr(args, name) for name, value in vars(saved).items() if name not in free)
 
 
 def lock(path: Path) -> int | None:
@@ -69,7 +71,10 @@ def lock(path: Path) -> int | None:
         import fcntl
     except ImportError:
         return None
-    handle = os.open(path, os.O_RDONLY)
+    try:
+        handle = os.open(path, os.O_RDONLY)
+    except OSError as error:
+        raise UserError(f"{path} is not a run directory: {error.strerror}") from error
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -86,47 +91,19 @@ def unlock(handle: int | None) -> None:
         os.close(handle)
 
 
+def clear(path: Path) -> None:
+    """Removes what the run there made before its first checkpoint, and no file of anyone else."""
+    if not (path / "config.json").exists():
+        return
+    events = path.glob(f"events.out.tfevents.*.{read_config(path).get('id', '?')}")
+    for file in [path / "config.json", path / "metrics.csv", *events]:
+        file.unlink(missing_ok=True)
+
+
 def remove_if_bare(path: Path) -> None:
     """Removes what a run wrote that ended before its first row, and the directory if nothing else is in it."""
     if not path.is_dir() or (path / "metrics.csv").exists() or (path / "checkpoints").exists():
         return
-    for file in [path / "config.json", *path.glob("events.out.tfevents.*")]:
-        file.unlink(missing_ok=True)
+    clear(path)
     if not any(path.iterdir()):
         path.rmdir()
-
-
-def read_config(path: Path) -> dict[str, Any]:
-    """``config.json`` of a run directory; a UserError if there is none."""
-    if not (path / "config.json").is_file():
-        raise UserError(f"{path} is not a run directory: it has no config.json")
-    return read_json(path / "config.json")
-
-
-def write_json(path: Path, content: dict[str, Any]) -> None:
-    """Write JSON in one step; NaN and infinity, which JSON does not have, become null."""
-    plain = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in content.items()}
-    temporary = path.with_name(path.name + ".tmp")
-    temporary.write_text(json.dumps(plain, indent=2, default=str) + "\n")
-    os.replace(temporary, path)
-
-
-def versions() -> dict[str, str]:
-    """Versions of Python and of the packages that can change a run's numbers."""
-    found = {"python": platform.python_version()}
-    for name in PACKAGES:
-        try:
-            found[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            continue
-    return found
-
-
-def git_revision() -> str | None:
-    """Revision of the working directory, ``-dirty`` with uncommitted changes; None outside a repository."""
-    command = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=10)
-    except (OSError, subprocess.TimeoutExpired):
-        return None
-    return done.stdout.strip() or None if done.returncode == 0 else None

@@ -1,9 +1,13 @@
 """A run's numbers: ``metrics.csv`` with a header that may grow, and the same scalars for TensorBoard."""
 
+import contextlib
 import csv
+import hashlib
+import io
 import math
 import os
 from collections.abc import Mapping, Sequence
+from logging import getLogger
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -11,14 +15,28 @@ from typing import Any
 import numpy as np
 from tensordict import TensorDictBase
 
+from pgkit import files
 from pgkit.errors import UserError
+
+_log = getLogger("pgkit")
 
 
 def read_csv(path: Path) -> tuple[list[str], list[dict[str, str]]]:
-    """The header and the whole rows of a metrics file, as text: a line that was cut short is left out."""
-    with path.open(newline="") as file:
-        reader = csv.DictReader(file)
-        return list(reader.fieldnames or []), [row for row in reader if None not in row and None not in row.values()]
+    """The header and the whole rows of a metrics file, as text: a line that was cut short is left out.
+
+    Raises:
+        UserError: it is no such file, or a value is no number.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            reader = csv.DictReader(file, strict=True)
+            columns = list(reader.fieldnames or [])
+            rows = [row for row in reader if None not in row and None not in row.values()]
+        for row in rows:
+            int(row["frames"]), [float(value) for value in row.values() if value]
+    except (OSError, ValueError, KeyError, csv.Error) as error:
+        raise UserError(f"{path} is damaged: {error}") from error
+    return columns, rows
 
 
 def column(rows: list[dict[str, str]], name: str) -> list[tuple[float, float]]:
@@ -26,46 +44,89 @@ def column(rows: list[dict[str, str]], name: str) -> list[tuple[float, float]]:
     return [(int(row["frames"]), float(row[name])) for row in rows if row.get(name)]
 
 
-class Metrics:
-    """Appends rows to ``run_dir/metrics.csv`` and to TensorBoard.
+def digest(path: Path, upto: int) -> str:
+    """The hash of the values in the rows with at most so many frames; columns that came later do not count."""
+    rows = read_csv(path)[1] if path.exists() else []
+    values = [sorted((k, v) for k, v in row.items() if v) for row in rows if int(row["frames"]) <= upto]
+    return hashlib.sha256(repr(values).encode()).hexdigest()
 
-    ``upto``: keep only the rows of an earlier run with at most so many frames (the frames in the checkpoint).
+
+class Metrics:
+    """Appends rows to ``run_dir/metrics.csv`` and to TensorBoard; where they cannot be written, they wait.
+
+    Args:
+        run_dir: the run directory.
+        upto: keep only the rows of an earlier run with at most so many frames (the frames in the checkpoint).
+        identity: ends the name of TensorBoard's file, by which the run knows its own.
     """
 
-    def __init__(self, run_dir: Path, upto: int = 0):
+    def __init__(self, run_dir: Path, upto: int = 0, identity: str = "pgkit") -> None:
         from torch.utils.tensorboard import SummaryWriter
 
         self.path = run_dir / "metrics.csv"
         self.columns: list[str] = []
+        self._waiting: list[dict[str, str]] = []
         if self.path.exists():
             self.columns, rows = read_csv(self.path)
             self._rewrite([row for row in rows if int(row["frames"]) <= upto])
-        self._board = SummaryWriter(str(run_dir), purge_step=upto + 1 if upto else None)
+        try:
+            purge = upto + 1 if upto else None
+            self._board: Any = SummaryWriter(str(run_dir), purge_step=purge, filename_suffix=f".{identity}")
+        except OSError as error:
+            files.cannot_write(run_dir, error)
 
     def write(self, row: Mapping[str, Any]) -> None:
         """Append one row, ``frames`` first. A new name becomes a new column; NaN is left empty."""
         text = {name: _text(value) for name, value in row.items()}
-        if new := [name for name in row if name not in self.columns]:
+        self._waiting.append(text)
+        try:
+            self._append()
+        except UserError as error:
+            _log.warning("%s; the training goes on, and its rows wait", error)
+        for name, value in row.items():
+            if self._board and text[name] and name != "frames":
+                self._to_board(name, value, row["frames"])
+
+    def _append(self) -> None:
+        new = list(dict.fromkeys(name for row in self._waiting for name in row if name not in self.columns))
+        if new or not self.path.exists():
             rows = read_csv(self.path)[1] if self.path.exists() else []
             self.columns += new
-            self._rewrite([*rows, text])
+            self._rewrite([*rows, *self._waiting])
         else:
-            with self.path.open("a", newline="") as file:
-                csv.DictWriter(file, self.columns, restval="").writerow(text)
-        for name, value in row.items():
-            if text[name] and name != "frames":
-                self._board.add_scalar(name, value, row["frames"])
+            lines = io.StringIO(newline="")
+            csv.DictWriter(lines, self.columns, restval="").writerows(self._waiting)
+            size = self.path.stat().st_size
+            try:
+                with self.path.open("a", newline="", encoding="utf-8") as file:
+                    file.write(lines.getvalue())
+            except OSError as error:
+                os.truncate(self.path, size)  # no half lines
+                files.cannot_write(self.path, error)
+        self._waiting = []
 
     def _rewrite(self, rows: list[dict[str, str]]) -> None:
-        temporary = self.path.with_suffix(".tmp")
-        with temporary.open("w", newline="") as file:
-            writer = csv.DictWriter(file, self.columns, restval="")
-            writer.writeheader()
-            writer.writerows(rows)
-        os.replace(temporary, self.path)
+        lines = io.StringIO(newline="")
+        writer = csv.DictWriter(lines, self.columns, restval="")
+        writer.writeheader()
+        writer.writerows(rows)
+        with files.replacing(self.path) as file:
+            file.write(lines.getvalue().encode())
+
+    def _to_board(self, name: str, value: Any, frames: int) -> None:
+        try:
+            self._board.add_scalar(name, value, frames)
+        except OSError as error:
+            self._board = None
+            _log.warning("TensorBoard's file cannot be written: %s; metrics.csv goes on", error.strerror)
 
     def close(self) -> None:
-        self._board.close()
+        """Ends TensorBoard's file; a UserError if rows are still waiting that cannot be written."""
+        if self._board:
+            with contextlib.suppress(OSError):
+                self._board.close()
+        if self._waiting:
+            self._append()
 
 
 def _text(value: float) -> str:

@@ -2,25 +2,26 @@
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
+from pgkit import files
 from pgkit.errors import UserError
-from pgkit.run.directory import read_config
+from pgkit.run.args import RunArgs, free_on_resume
+from pgkit.run.config import read_config
 from pgkit.run.metrics import column, read_csv
-from pgkit.run.settings import RunArgs
 
 Curve = list[tuple[float, float]]
 TRAINING, EVALUATION = "rollout/ep_rew_mean", "eval/mean_reward"
-# settings in which runs of one experiment may differ: they do not change what is learned
-_INCIDENTAL = {field.name for field in fields(RunArgs)} - {"num_envs"} | {"log_every", "save_buffer", "buffer_dir"}
+_WHICH_RUN = {"env_id", "seed", "run_dir"}  # they tell runs apart, and experiments not
 
 
-def plot(run_dirs: Sequence[str | Path], out: str | Path, x: Literal["frames", "wall"] = "frames") -> None:
-    """Draw return against frames, or against minutes of training, to ``out`` (png, pdf, svg by its ending).
+def plot(run_dirs: Sequence[str | Path], out: str | Path, x: Literal["frames", "wall"] = "frames") -> Path:
+    """Draw return against frames, or against minutes of training, to ``out``; returns the file that was written.
+
+    Its ending says what is written: png, pdf, svg; without one it is ``.png``.
 
     One panel an env. Runs of the same env, recipe and settings are seeds of one experiment: the line is their mean,
     the band one standard deviation either side. Lines are training returns, dots are evaluations. Experiments of one
@@ -33,7 +34,7 @@ def plot(run_dirs: Sequence[str | Path], out: str | Path, x: Literal["frames", "
     for run_dir, label in labels(configs).items():
         if not (run_dir / "metrics.csv").is_file():
             raise UserError(f"{run_dir} has no metrics.csv: nothing was logged there yet")
-        panels[configs[run_dir]["settings"]["env_id"]].setdefault(label, []).append(run_dir)
+        panels[configs[run_dir]["settings"].get("env_id", "?")].setdefault(label, []).append(run_dir)
     figure = Figure(figsize=(6.4 * len(panels), 4.2), layout="constrained")
     for axes, (env_id, experiments) in zip(
         figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True
@@ -53,12 +54,18 @@ def plot(run_dirs: Sequence[str | Path], out: str | Path, x: Literal["frames", "
         axes.grid(alpha=0.3)
         if axes.get_legend_handles_labels()[0]:
             axes.legend(frameon=False)
-    if Path(out).is_dir():
-        raise UserError(f"cannot write {out}: it is a directory, give a file name in it")
+    out = Path(out)
     try:
-        figure.savefig(out, dpi=150)
+        if out.is_dir():
+            raise UserError(f"cannot write {out}: it is a directory, give a file name in it")
+        out = out if out.suffix else out.with_suffix(".png")
+        with files.replacing(out) as file:
+            figure.savefig(file, dpi=150, format=out.suffix[1:])
     except (OSError, ValueError) as error:
+        if isinstance(error, UserError):
+            raise
         raise UserError(f"cannot write {out}: {error}") from error
+    return out
 
 
 def labels(configs: Mapping[Path, Mapping[str, Any]]) -> dict[Path, str]:
@@ -66,24 +73,24 @@ def labels(configs: Mapping[Path, Mapping[str, Any]]) -> dict[Path, str]:
     names, recipes = {}, {run_dir: _recipe(config) for run_dir, config in configs.items()}
     for run_dir, config in configs.items():
         settings = config["settings"]
+        incidental = _WHICH_RUN.union(config.get("may_change", free_on_resume(RunArgs)))
         peers = [
             other["settings"]
             for path, other in configs.items()
-            if recipes[path] == recipes[run_dir] and other["settings"]["env_id"] == settings["env_id"]
+            if recipes[path] == recipes[run_dir] and other["settings"].get("env_id") == settings.get("env_id")
         ]
         differing = [
             f"{name}={value}"
             for name, value in settings.items()
-            if name not in _INCIDENTAL and any(peer.get(name) != value for peer in peers)
+            if name not in incidental and any(peer.get(name) != value for peer in peers)
         ]
         names[run_dir] = " ".join([recipes[run_dir], *differing])
     return names
 
 
 def _recipe(config: Mapping[str, Any]) -> str:
-    command = Path(config.get("command", [""])[0])
-    same = command.suffix != ".py" or command.stem == config["recipe"]
-    return config["recipe"] if same else f"{config['recipe']} ({command.name})"
+    file = Path(config.get("file") or config["recipe"])
+    return config["recipe"] if file.stem == config["recipe"] else f"{config['recipe']} ({file.name})"
 
 
 def _curve(rows: list[dict[str, str]], name: str, x: str) -> Curve:

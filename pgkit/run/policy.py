@@ -3,17 +3,14 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
 
 from pgkit.errors import UserError
-from pgkit.run import checkpoint
-from pgkit.run.directory import read_config
+from pgkit.run.agent import Agent, Which, restored
 from pgkit.run.evaluate import Acting
-
-Which = Literal["best", "latest"]
 
 
 @dataclass
@@ -83,18 +80,13 @@ def describe_env(env: Any) -> dict[str, Any]:
     }
 
 
-def load_policy(run_dir: str | Path, which: Which = "best") -> Policy:
-    """The policy of a run: ``best`` by ``eval/mean_reward``, or ``latest``. The recipe's file is not needed.
-
-    It unpickles: open only run directories that you trust.
-    """
-    run_dir = Path(run_dir)
-    read_config(run_dir)
-    folder = run_dir / "checkpoints"
-    if which == "best" and not (folder / "best.pt").exists() and (folder / "latest.pt").exists():
-        raise UserError(f"{run_dir} has no evaluation yet, so no best policy: ask for the latest (--which latest)")
-    saved = checkpoint.load(folder / f"{which}.pt")
-    policy = Policy(**checkpoint.load(folder / "policy.pt"), frames=saved["frames"])
-    policy.actor.load_state_dict(saved["states"]["policy"])
-    policy.actor.eval()
-    return policy
+def load_policy(
+    run_dir: str | Path,
+    which: Which = "best",
+    *,
+    agent: Callable[..., Agent] | None = None,
+    trust: bool = False,
+) -> Policy:
+    """The policy of a run: ``best`` by ``eval/mean_reward``, or ``latest``; arguments as in :func:`load_agent`."""
+    built, args, env, frames = restored(Path(run_dir), which, agent, trust, only_actor=True)
+    return Policy(built.actor.eval(), args.make_env, **describe_env(env), frames=frames)

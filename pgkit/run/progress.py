@@ -1,5 +1,6 @@
 """What a run shows while it trains: a live bar on a terminal, a line an evaluation on a pipe."""
 
+import contextlib
 import math
 from collections.abc import Mapping
 
@@ -34,7 +35,8 @@ class Live:
 
     def update(self, frames: int, score: float, fps: float) -> None:
         """Show the latest mean return and speed."""
-        self._bar.update(self._task, completed=frames, score=_short(score, ".1f"), fps=_short(fps, ",.0f"))
+        with contextlib.suppress(BrokenPipeError):
+            self._bar.update(self._task, completed=frames, score=_short(score, ".1f"), fps=_short(fps, ",.0f"))
 
     def evaluated(self, frames: int, score: float, fps: float, scores: Mapping[str, float]) -> None:
         """Print the line of an evaluation."""
@@ -43,14 +45,17 @@ class Live:
         self.line(f"frames {frames:>10,}   return {_short(score, '.1f')}   eval {result}   {speed}")
 
     def line(self, text: str) -> None:
-        """Print a line: above the bar on a terminal, as it is on a pipe."""
-        if self._bar.disable:
-            print(text, flush=True)
-        else:
-            self._bar.console.print(text, highlight=False, markup=False, soft_wrap=True)
+        """Print a line: above the bar on a terminal, as it is on a pipe, whose reader may be gone."""
+        with contextlib.suppress(BrokenPipeError):
+            if self._bar.disable:
+                print(text, flush=True)
+            else:
+                self._bar.console.print(text, highlight=False, markup=False, soft_wrap=True)
 
     def close(self) -> None:
-        self._bar.stop()
+        """Ends the bar."""
+        with contextlib.suppress(BrokenPipeError):
+            self._bar.stop()
 
 
 def _short(value: float, spec: str) -> str:

@@ -1,157 +1,219 @@
 """One training run, as a recipe holds it: log a step, and evaluation and checkpoints follow when due."""
 
+from __future__ import annotations
+
 import logging
 import math
+import secrets
 import shlex
 import signal
-import sys
 import threading
+import traceback
 from collections import deque
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from statistics import mean, median
-from types import FrameType
-from typing import Any
+from types import FrameType, TracebackType
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
-from pgkit.errors import UserError
-from pgkit.run import checkpoint, directory, seeding
+from pgkit import files
+from pgkit.errors import Diverged, UserError
+from pgkit.run import checkpoint, config, directory, seeding
+from pgkit.run.agent import Agent
+from pgkit.run.args import RunArgs, check
 from pgkit.run.clock import Clock
 from pgkit.run.evaluate import check_playable, evaluate
-from pgkit.run.metrics import Metrics, averages, column, finished_episodes, read_csv, warm
+from pgkit.run.metrics import Metrics, averages, column, digest, finished_episodes, read_csv, warm
 from pgkit.run.plots import plot
-from pgkit.run.policy import describe_env
 from pgkit.run.progress import Live
-from pgkit.run.settings import RunArgs, as_resumed, check, recipe_target
+from pgkit.seams import Stateful
 
 NAN = float("nan")
+SIGNALS = [s for s in signal.Signals if s.name in ("SIGINT", "SIGTERM", "SIGHUP")]
+_log = logging.getLogger("pgkit")
+
+
+@runtime_checkable
+class Compiles(Protocol):
+    """What spends time on compiling, which does not count as training."""
+
+    @property
+    def compile_seconds(self) -> float: ...
 
 
 class Run:
     """Seeds on entry, writes the run directory, ends with an evaluation, a summary and a curve.
 
     Nothing is written before :meth:`track`, and a run that ends before its first row leaves no directory behind. Ctrl-C
-    (or SIGTERM) lets the running update finish, saves ``latest`` and ends the run; a second one ends it at once. One
-    during an evaluation ends that, and a failed evaluation ends the run: both after ``latest`` is saved.
+    (or SIGTERM, or SIGHUP) lets the running update finish, saves ``latest`` and ends the run; a second one ends it at
+    once. One during an evaluation ends that, and a failed evaluation ends the run: both after ``latest`` is saved. Any
+    other error ends the run after ``latest`` is saved as of the last whole update.
 
     Raises:
         UserError: the directory holds a run; or the resumed one has no checkpoint, is another recipe's, or
             has already trained for ``total_frames``.
+        Diverged: at the end, or at a checkpoint: the losses, or the weights, are not finite. No checkpoint that is
+            finite is replaced by one that is not.
     """
 
     def __init__(self, args: RunArgs, recipe: str):
         check(args)
         self.args, self.recipe = args, recipe
         self.dir = directory.choose(args, recipe)
-        self._saved = self._load() if args.resume else None
-        counters = self._saved["counters"] if self._saved else {}
-        self.frames: int = self._saved["frames"] if self._saved else 0
-        self.best: dict[str, float] = counters.get("best", {})
-        self._evaluated: dict[str, float] = counters.get("evaluated", {})
-        self._episodes = deque[tuple[float, int]](counters.get("episodes", ()), maxlen=100)
+        self.frames = 0
+        self.best: dict[str, float] = {}
+        self._evaluated: dict[str, float] = {}
+        self._episodes = deque[tuple[float, int]](maxlen=100)
         self._recent: list[Mapping[str, float]] = []  # metrics since the last row
-        self._clock = Clock(already=counters.get("wall_s", 0.0))
-        self._tracked: dict[str, checkpoint.Stateful] = {}
+        self._clock = Clock()
+        self._saved: dict[str, Any] | None = None
+        self._tracked: dict[str, Stateful] = {}
         self._eval: Any = None
-        self._interrupted = self._diverged = self._evaluating = False
+        self._interrupted = self._evaluating = False
+        self._lost = ""  # a metric of the last row that is not finite
+        self._seen = self._saved_at = 0  # frames of the last step, and in the last checkpoint
+        self._claimed = False
         self._lock: int | None = None
 
-    def _load(self) -> dict[str, Any]:
-        config = directory.read_config(self.dir)
-        if config["recipe"] != self.recipe:
-            raise UserError(f"{self.dir} holds a run of {config['recipe']}, not of {self.recipe}: use that recipe")
-        as_resumed(self.args, self.dir)
-        first, now = (Path(command[0]).name for command in (config["command"], sys.argv))
-        if first.endswith(".py") and first != now:
-            logging.getLogger("pgkit").warning("%s is a run of %s, this is %s: is it the same?", self.dir, first, now)
-        saved = checkpoint.load(self.dir / "checkpoints" / "latest.pt")
+    def __enter__(self) -> Run:
+        torch.set_num_threads(self.args.threads)
+        seeding.seed_everything(self.args.seed)
+        if self.args.resume:
+            self._lock = directory.lock(self.dir)  # before it reads: another process may be further
+            try:
+                self._load(Path(self.args.resume))
+            except BaseException:
+                directory.unlock(self._lock)
+                raise
+        self._handlers: dict[signal.Signals, Any] = {}
+        if threading.current_thread() is threading.main_thread():
+            heard = [s for s in SIGNALS if s.name == "SIGINT" or signal.getsignal(s) != signal.SIG_IGN]  # nohup ignores
+            self._handlers = {s: signal.signal(s, self._interrupt) for s in heard}
+        return self
+
+    def _load(self, resume: Path) -> None:
+        before = config.read_config(self.dir)
+        if before["recipe"] != self.recipe:
+            raise UserError(f"{self.dir} holds a run of {before['recipe']}, not of {self.recipe}: use that recipe")
+        config.as_resumed(self.args, self.dir)
+        theirs, mine = before.get("file"), config.recipe_file(type(self.args))
+        if theirs != mine:
+            _log.warning("%s is a run of %s, this is %s: is it the same?", self.dir, theirs or "pgkit's recipe", mine)
+        saved = checkpoint.load(resume if resume.suffix == ".pt" else resume / "checkpoints" / "latest.pt")
         if self.args.total_frames <= saved["frames"]:
+            if self.args.resume_if_possible:
+                print(f"{self.dir} has already trained {saved['frames']:,} frames: there is nothing left to do")
+                raise SystemExit(0)
             raise UserError(
                 f"{self.dir} has already trained {saved['frames']} frames: give a --total-frames above that"
             )
-        return saved
+        rows = self.dir / "metrics.csv"
+        if rows.exists() and digest(rows, saved["frames"]) != saved["counters"].get("metrics"):
+            raise UserError(f"{rows} is damaged: its rows are not those that were saved; move it away to go on without")
+        self._saved = saved
+        self.frames = self._seen = self._saved_at = saved["frames"]
+        with checkpoint.damage(self.dir):
+            counters = saved["counters"]
+            self.best, self._evaluated = {**counters["best"]}, {**counters["evaluated"]}
+            self._episodes.extend((float(reward), int(length)) for reward, length in counters["episodes"])
+            self._clock = Clock(already=float(counters["wall_s"]))
 
-    def __enter__(self) -> "Run":
-        torch.set_num_threads(self.args.threads)
-        seeding.seed_everything(self.args.seed)
-        if threading.current_thread() is threading.main_thread():
-            self._handlers = {s: signal.signal(s, self._interrupt) for s in (signal.SIGINT, signal.SIGTERM)}
-        return self
-
-    def track(self, *, policy: torch.nn.Module, eval_env: Callable[..., Any], **stateful: checkpoint.Stateful) -> None:
+    def track(
+        self,
+        *,
+        eval_env: Callable[..., Any],
+        agent: Agent | None = None,
+        policy: torch.nn.Module | None = None,
+        **stateful: Stateful,
+    ) -> None:
         """Name what to evaluate and what to save; on a resume, load the checkpoint into it.
 
         With ``--explain`` it prints the update, which says how the agent is wired, and ends the program.
 
         Args:
-            policy: the actor; reads ``observation``, writes ``action``.
-            eval_env: picklable; ``eval_env(num_envs=, seed=)`` makes the evaluation's own env.
-            stateful: whatever else the run must restore (update, collector, normalizer, ...).
+            eval_env: ``eval_env(num_envs=, seed=)`` makes the evaluation's own env: ``args.make_env``.
+            agent: what is trained; its actor is evaluated, and its parts are saved.
+            policy: the actor alone, in place of an agent.
+            stateful: whatever else the run must restore (update, collector, replay, ...).
         """
         if not callable(eval_env) or isinstance(eval_env, EnvBase):
             raise UserError(
                 f"track(eval_env=...) takes a function that makes an environment, this is a {type(eval_env).__name__}: "
                 "functools.partial(envs.make, env_id)"
             )
-        tracked: dict[str, checkpoint.Stateful] = {"policy": policy, **stateful}
+        if agent is None:
+            if policy is None:
+                raise UserError("track(...) takes an agent=run.Agent(...), or a policy=")
+            agent = Agent(policy)
         if self.args.explain:
-            print(stateful.get("update", policy))
+            print(stateful.get("update", agent.actor))
             raise SystemExit(0)
-        resumed_at = []
-        if self._saved:
-            self._lock = directory.lock(self.dir)
-            checkpoint.restore(tracked, self._saved["states"], self.dir / "checkpoints" / "latest.pt")
-            seeding.set_rng_state(self._saved["rng"])
-            resumed_at = [*directory.read_config(self.dir)["resumed_at"], self.frames]
-        self._policy, self._make_env = policy, eval_env
+        self._agent, self._make_env = agent, eval_env
         self._eval_env()  # what is wrong with it shows before the training, not after
-        directory.write_config(self.dir, self.args, self.recipe, resumed_at)
-        self._lock = self._lock or directory.lock(self.dir)
-        self._metrics = Metrics(self.dir, upto=self.frames)
+        tracked: dict[str, Stateful] = {"agent": agent, **stateful}
+        self._claim(tracked)
         self._live = Live(self.args.total_frames, self.frames)
         self._tracked = tracked
         self._clock.restart(self.frames)
+
+    def _claim(self, tracked: dict[str, Stateful]) -> None:
+        """Restores what is resumed, or what the run begins with, and writes the first files."""
+        before, identity = None, secrets.token_hex(4)
+        if self._saved:
+            checkpoint.restore(tracked, self._saved["states"], self.dir / "checkpoints" / "latest.pt")
+            with checkpoint.damage(self.dir):
+                seeding.set_rng_state(self._saved["rng"])
+            before = config.read_config(self.dir)
+            before["resumed_at"], identity = [*before["resumed_at"], self.frames], before["id"]
+            self._saved["states"] = {}  # a copy of everything
+        elif self.args.init:
+            folder = self.args.init / "checkpoints"
+            path = folder / ("best.pt" if (folder / "best.pt").exists() else "latest.pt")
+            checkpoint.restore({"agent": self._agent}, {"agent": checkpoint.load(path)["states"].get("agent")}, path)
+        if not self._saved and directory.holds_run(self.dir):  # and has saved nothing: this run takes its place
+            self._lock = directory.lock(self.dir)
+            directory.clear(self.dir)
+        config.write_config(self.dir, self.args, self.recipe, before, identity)
+        self._claimed = not self._saved
+        self._lock = self._lock if self._lock is not None else directory.lock(self.dir)
+        self._metrics = Metrics(self.dir, upto=self.frames, identity=identity)
 
     def step(
         self,
         frames: int,
         rollout: TensorDictBase | None = None,
         metrics: Mapping[str, float] | None = None,
-        compile_seconds: float = 0.0,
+        compile_seconds: float | None = None,
         every: int = 1,
-    ) -> None:
-        """Log one update in ``metrics.csv``; evaluate and save when due.
+    ) -> dict[str, float]:
+        """Log one update in ``metrics.csv``; evaluate and save when due. Returns the row, empty where none is due.
 
         Args:
             frames: env steps taken so far, all envs together.
             rollout: ``[num_envs, T]``; its finished episodes enter the mean of the last 100.
             metrics: logged as ``train/<name>``, or as they are if the name holds a ``/``.
-            compile_seconds: seconds this process has spent compiling so far; left out of ``time/fps``.
+            compile_seconds: seconds this process has spent compiling so far, left out of ``time/fps``; None: what the
+                tracked objects say.
             every: a row only every so many frames, with the means of the metrics since the last one.
         """
         if not self._tracked:
             raise RuntimeError("call track(policy=..., eval_env=...) before the first step(...)")
+        self._seen = frames
         self._episodes.extend(finished_episodes(rollout))
         self._recent += [metrics] if metrics else []
         due = frames >= self.args.total_frames
         if self.args.eval_every:
             due |= frames // self.args.eval_every > self.frames // self.args.eval_every
         if not (due or self._interrupted or frames // every > self.frames // every):
-            return
+            return {}
         self.frames = frames
-        row: dict[str, float] = {
-            "frames": frames,
-            "time/fps": self._clock.fps(frames, compile_seconds),
-            "time/wall_s": self._clock.wall,
-            "rollout/ep_rew_mean": mean(reward for reward, _ in self._episodes) if self._episodes else NAN,
-            "rollout/ep_len_mean": mean(length for _, length in self._episodes) if self._episodes else NAN,
-        }
-        row |= {name if "/" in name else f"train/{name}": value for name, value in averages(self._recent).items()}
-        self._recent = []
-        self._warn_of_divergence(row)
+        if compile_seconds is None:
+            compile_seconds = sum(x.compile_seconds for x in self._tracked.values() if isinstance(x, Compiles))
+        row = self._row(compile_seconds)
         self._live.update(frames, row["rollout/ep_rew_mean"], row["time/fps"])
         if due:
             try:
@@ -162,21 +224,32 @@ class Run:
                 raise
         self._metrics.write(row)
         if due or self._interrupted:
-            self.save()
+            try:
+                self.save()
+            except UserError as error:
+                _log.warning("%s; the training goes on", error)
         if self._interrupted:
             raise KeyboardInterrupt
+        return row
 
-    def _warn_of_divergence(self, row: Mapping[str, float]) -> None:
+    def _row(self, compile_seconds: float) -> dict[str, float]:
+        row: dict[str, float] = {
+            "frames": self.frames,
+            "time/fps": self._clock.fps(self.frames, compile_seconds),
+            "time/wall_s": self._clock.wall,
+            "rollout/ep_rew_mean": mean(reward for reward, _ in self._episodes) if self._episodes else NAN,
+            "rollout/ep_len_mean": mean(length for _, length in self._episodes) if self._episodes else NAN,
+        }
+        row |= {name if "/" in name else f"train/{name}": value for name, value in averages(self._recent).items()}
+        self._recent = []
         lost = [name for name, value in row.items() if name.startswith("train/") and not math.isfinite(value)]
-        if lost and not self._diverged:
-            self._diverged = True
-            logging.getLogger("pgkit").warning(
+        if lost and not self._lost:
+            _log.warning(
                 "%s is %s at %s frames: the training has diverged; stop it (Ctrl-C) and start again with lower "
-                "learning rates or a lower --max-grad-norm",
-                lost[0],
-                row[lost[0]],
-                f"{row['frames']:,}",
-            )
+                "learning rates or a lower --max-grad-norm", lost[0], row[lost[0]], f"{self.frames:,}",
+            )  # fmt: skip
+        self._lost = lost[0] if lost else ""
+        return row
 
     def _eval_env(self) -> Any:
         if self._eval is None:
@@ -199,7 +272,7 @@ class Run:
             env.set_seed(seeding.evaluation_seed(self.args.seed, self.frames))
             self._evaluating = True
             try:
-                scores = evaluate(self._policy, env, self.args.eval_episodes)
+                scores = evaluate(self._agent.actor, env, self.args.eval_episodes)
             finally:
                 self._evaluating = False
             self._evaluated = {"frames": self.frames, **scores}
@@ -209,13 +282,19 @@ class Run:
         return scores
 
     def save(self) -> None:
-        """Save ``latest`` (and ``best``, if the evaluation just made is) to ``checkpoints/``."""
+        """Save ``latest`` (and ``best``, if the evaluation just made is) to ``checkpoints/``.
+
+        Raises:
+            Diverged: a weight is not finite; the checkpoints before stay.
+            UserError: the files cannot be written.
+        """
         with self._clock.paused():
-            folder = self.dir / "checkpoints"
-            if not (folder / "policy.pt").exists():
-                env = describe_env(self._eval_env())
-                actor = {"actor": self._policy, "make_env": self._make_env}
-                checkpoint.save(folder / "policy.pt", actor | env)
+            for part in vars(self._agent).values():
+                if isinstance(part, torch.nn.Module) and not checkpoint.finite(part):
+                    raise Diverged(
+                        f"the weights are not finite at {self.frames:,} frames: start again with lower learning rates; "
+                        f"{self.dir} keeps its checkpoint of {self._saved_at:,} frames"
+                    )
             content = {
                 "recipe": self.recipe,
                 "frames": self.frames,
@@ -226,32 +305,63 @@ class Run:
                     "evaluated": self._evaluated,
                     "episodes": list(self._episodes),
                     "wall_s": self._clock.wall,
+                    "metrics": digest(self.dir / "metrics.csv", self.frames),
                 },
             }
+            folder = self.dir / "checkpoints"
             if self.best.get("frames") == self.frames:  # first: latest says that there is one
-                checkpoint.save(folder / "best.pt", content)
-            checkpoint.save(folder / "latest.pt", content)
+                files.save(folder / "best.pt", content)
+            files.save(folder / "latest.pt", content)
+            self._saved_at = self.frames
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
-        if threading.current_thread() is threading.main_thread():
-            for number, handler in self._handlers.items():
-                signal.signal(number, handler)
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None):
+        for number, handler in self._handlers.items():
+            signal.signal(number, handler)
         if not self._tracked:
+            if self._claimed:
+                directory.remove_if_bare(self.dir)
             directory.unlock(self._lock)
             return
         try:
             if kind is None:
                 self._finish()
+            elif error is not None and kind is not KeyboardInterrupt:
+                self._rescue(error, trace)
         finally:
             self._live.close()
+            self._close()
+        if kind is None or (kind is KeyboardInterrupt and self._saved_at):
+            self._say_how_to_go_on()
+        if isinstance(error, SystemExit):
+            raise UserError(f"something called sys.exit({error.code}) after {self._seen:,} frames") from error
+        if kind is None and self._lost:
+            raise Diverged(f"the training has diverged: {self._lost} is not finite at the end ({self.frames:,} frames)")
+
+    def _close(self) -> None:
+        try:
             self._metrics.close()
+        finally:
             if not self._saved:
                 directory.remove_if_bare(self.dir)
             directory.unlock(self._lock)
             if self._eval is not None:
                 self._eval.close()
-        if kind is None or (kind is KeyboardInterrupt and (self.dir / "checkpoints" / "latest.pt").exists()):
-            self._say_how_to_go_on()
+
+    def _rescue(self, error: BaseException, trace: TracebackType | None) -> None:
+        """Saves what was trained until an error, unless that broke into an update and left it half done."""
+        if isinstance(error, Diverged) or self._seen <= self._saved_at:
+            return
+        update = self._tracked.get("update")
+        if any(frame.f_locals.get("self") is update for frame, _ in traceback.walk_tb(trace) if update is not None):
+            why = "the error came in the middle of an update"
+        else:
+            self.frames, why = self._seen, ""
+            try:
+                self.save()
+            except Exception as other:  # of an environment or a worker that is gone; the first error is what counts
+                why = f"{other}"
+        where = f"the checkpoint of {self._saved_at:,} frames" if self._saved_at else "no checkpoint yet"
+        _log.warning("the run ends at an error; %s has %s%s", self.dir, where, f" ({why})" if why else "")
 
     def _interrupt(self, number: int, frame: FrameType | None) -> None:
         if self._interrupted or self._evaluating or not self._tracked:
@@ -263,6 +373,7 @@ class Run:
         if self._evaluated.get("frames") != self.frames:
             scores = self._evaluate({})
             self._metrics.write({"frames": self.frames, "time/wall_s": self._clock.wall, **scores})
+        if self._saved_at != self.frames:
             self.save()
         rows = read_csv(self.dir / "metrics.csv")[1]
         fps = [value for _, value in column(rows, "time/fps")]
@@ -279,15 +390,17 @@ class Run:
             "best/mean_reward": self.best.get("eval/mean_reward", NAN),
             "best/frames": self.best.get("frames", 0),
         }
-        directory.write_json(self.dir / "summary.json", summary)
+        config.write_json(self.dir / "summary.json", summary, hashed=False)
         plot([self.dir], self.dir / "curve.png")
 
     def _say_how_to_go_on(self) -> None:
-        where = shlex.quote(str(self.dir))
+        where, target = shlex.quote(str(self.dir)), config.recipe_target(type(self.args), self.recipe)
         total = self.args.total_frames * (2 if self.frames >= self.args.total_frames else 1)
-        print(
+        imports = " --trust" if self.args.imports() else ""
+        trust = " --trust" if imports or config.recipe_file(type(self.args)) else ""
+        self._live.line(
             f"run directory: {self.dir}\n"
-            f"  resume    pgkit run {recipe_target(self.recipe)} --resume {where} --total-frames {total}\n"
-            f"  evaluate  pgkit eval {where}{'' if self.best else ' --which latest'}\n"
+            f"  resume    pgkit run {target} --resume {where} --total-frames {total}{imports}\n"
+            f"  evaluate  pgkit eval {where}{'' if self.best else ' --which latest'}{trust}\n"
             f"  plot      pgkit plot {where}"
         )

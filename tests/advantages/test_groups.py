@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from pgkit.updates.recorded import recorded_block
 from tensordict import TensorDict
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from torchrl.modules import MultiAgentMLP, ProbabilisticActor
@@ -10,7 +11,6 @@ from torchrl.objectives.value import MultiAgentGAE
 from pgkit import advantages, modules
 from pgkit.errors import UserError
 from pgkit.functional import standardize
-from pgkit.updates.recorded import recorded_block
 
 N, T, A = 3, 11, 2
 

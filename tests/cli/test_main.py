@@ -22,12 +22,6 @@ from torchrl.data import Bounded, Composite, Unbounded
 from pgkit import run
 
 
-@dataclass
-class Args(run.RunArgs):
-    width: int = 2
-    """How wide."""
-
-
 class Env:
     action_spec_unbatched = Bounded(-1.0, 1.0, (1,))
     observation_spec_unbatched = Composite(observation=Unbounded((2,)))
@@ -42,13 +36,26 @@ class Env:
     def step(self, action): return self.obs, None, np.ones(len(self.obs), bool), np.zeros(len(self.obs), bool)
 
 
+@dataclass
+class Args(run.RunArgs):
+    width: int = 2
+    """How wide."""
+
+    def make_env(self, num_envs, seed, workers=1):
+        return Env(num_envs, seed)
+
+
 class Net(torch.nn.Linear):
     """A class that exists in this file alone."""
 
 
+def agent(args: Args, env):
+    return run.Agent(TensorDictModule(Net(args.width, 1), ["observation"], ["action"]))
+
+
 def main(args):
     with run.Run(args, recipe="walk") as log:
-        log.track(policy=TensorDictModule(Net(args.width, 1), ["observation"], ["action"]), eval_env=Env)
+        log.track(agent=agent(args, None), eval_env=args.make_env)
         for frames in range(log.frames + 10, args.total_frames + 1, 10):
             log.step(frames)
 
@@ -58,10 +65,31 @@ if __name__ == "__main__":
 '''
 
 
-def pgkit(*words: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+SAY = '''"""Say."""
+from dataclasses import dataclass
+
+from pgkit import run
+
+VARIANTS = {"loud": dict(seed=2, tone="a")}
+
+
+@dataclass
+class Args(run.RunArgs):
+    variant: str = ""
+    tone: str = "b"
+
+
+def main(args):
+    raise SystemExit(f"{__name__} {args.variant} {args.seed} {args.tone}")
+'''
+
+
+def pgkit(*words: str, cwd: Path, **environ: str) -> subprocess.CompletedProcess[str]:
+    """The installed script, which Python does not look for modules beside: ``python -P``."""
     code = "from pgkit.cli.main import main; main()"
-    command = [sys.executable, "-W", "error", "-c", code, *words]
-    return subprocess.run(command, cwd=cwd, env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True)
+    command = [sys.executable, "-P", "-W", "error", "-c", code, *words]
+    environ = os.environ | {"PYTHONPATH": str(ROOT)} | environ
+    return subprocess.run(command, cwd=cwd, env=environ, capture_output=True, text=True)
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +109,7 @@ def inside(trained: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(trained)
     monkeypatch.setattr(sys, "argv", sys.argv)
     monkeypatch.setattr(sys, "path", [*sys.path])
-    monkeypatch.setitem(sys.modules, "__main__", sys.modules["__main__"])
+    monkeypatch.setattr(sys, "excepthook", sys.excepthook)
     return trained
 
 
@@ -94,14 +122,18 @@ def fail(capsys: pytest.CaptureFixture[str], *words: str) -> str:
     return error
 
 
-def test_eval_needs_no_recipe(trained: Path):
-    (trained / "walk.py").rename(trained / "gone")
-    try:
-        done = pgkit("eval", "r", "--episodes", "3", "--which", "latest", cwd=trained)
-    finally:
-        (trained / "gone").rename(trained / "walk.py")
-    assert done.returncode == 0, done.stderr
-    assert "3 episodes" in done.stdout and "mean_reward      7.00" in done.stdout
+def test_eval_runs_a_recipe_file_only_where_it_is_trusted(inside: Path, capsys: pytest.CaptureFixture[str], caplog):
+    words = ["eval", "r", "--episodes", "3", "--which", "latest"]
+    assert f"r is a run of {inside / 'walk.py'}, which would be run: --trust" in fail(capsys, *words)
+    main([*words, "--trust"])
+    out = capsys.readouterr().out
+    assert "3 episodes" in out and "mean_reward      7.00" in out and not caplog.text
+    (inside / "walk.py").write_text(RECIPE + "\n")
+    main([*words, "--trust"])
+    assert "walk.py has changed since the run" in caplog.text
+    (inside / "walk.py").unlink()
+    assert "which is not there" in fail(capsys, *words, "--trust")
+    (inside / "walk.py").write_text(RECIPE)
 
 
 def test_a_user_error_in_a_recipe_is_one_line_and_exit_2(trained: Path):
@@ -165,15 +197,12 @@ def test_ls_shows_first_lines_and_runs_nothing(shelf: Path, capsys: pytest.Captu
 
 
 def test_variants_are_listed_with_their_settings_run_and_copied(shelf: Path, inside: Path, capsys, monkeypatch):
-    recipe = (
-        '"""Say."""\nVARIANTS = {"loud": dict(num_times=2, tone="a")}\nimport sys\nraise SystemExit((*sys.argv,))\n'
-    )
-    (shelf / "shelf/say.py").write_text(recipe)
+    (shelf / "shelf/say.py").write_text(SAY)
     main(["ls"])
-    assert "loud         say --num-times 2 --tone a" in capsys.readouterr().out.splitlines()
+    assert "loud         say --seed 2 --tone a" in capsys.readouterr().out.splitlines()
     with pytest.raises(SystemExit) as exit_:
         main(["run", "loud", "--seed", "3"])
-    assert exit_.value.code == ("loud", "--variant", "loud", "--seed", "3")
+    assert exit_.value.code == "say loud 3 a"
     main(["cp", "loud", str(shelf / "mine.py")])
     assert capsys.readouterr().out.endswith("mine.py --variant loud\n")
     assert "nearest: loud" in fail(capsys, "run", "loudd")
@@ -189,11 +218,15 @@ def test_cp_copies_and_never_overwrites(shelf: Path, capsys: pytest.CaptureFixtu
     assert "no directory" in fail(capsys, "cp", "ppo", str(shelf / "no/mine.py"))
 
 
-def test_a_shipped_recipe_is_run_under_the_name_that_was_typed(shelf: Path, inside: Path):
-    (shelf / "shelf/say.py").write_text("import sys\nraise SystemExit((__name__, *sys.argv))\n")
+def test_a_recipe_is_imported_and_hides_no_module(shelf: Path, inside: Path, capsys: pytest.CaptureFixture[str]):
+    before = sys.modules["__main__"], sys.modules["queue"], [*sys.path]
+    (shelf / "shelf/queue.py").write_text(SAY)
     with pytest.raises(SystemExit) as exit_:
-        main(["run", "say", "--seed", "3"])
-    assert exit_.value.code == ("__main__", "say", "--seed", "3")
+        main(["run", "queue", "--seed", "3"])
+    assert exit_.value.code == "queue_recipe  3 b"
+    assert (sys.modules["__main__"], sys.modules["queue"], sys.path[: len(before[2])]) == before
+    (shelf / "shelf/half.py").write_text('"""Half a recipe."""\ndef main(args): ...\n')
+    assert "half.py has no Args: a recipe has a class Args and a function main(args)" in fail(capsys, "run", "half")
 
 
 def test_an_unknown_recipe_names_the_nearest(shelf: Path, capsys: pytest.CaptureFixture[str]):

@@ -9,7 +9,7 @@ from torchrl.envs import EnvBase
 from torchrl.objectives import SoftUpdate
 
 from pgkit import controllers, losses, modules
-from pgkit.compiling import record
+from pgkit.compiled.native import record
 from pgkit.errors import UserError
 from pgkit.functional import quantized_pixels
 from tests.modules.test_groups import Team

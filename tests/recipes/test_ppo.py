@@ -15,14 +15,14 @@ from pgkit.cli.main import main
 def pgkit(*argv, ok=True):
     """The command line in this process: one of its own costs five seconds of imports (tests/cli has those)."""
     out, err, code = io.StringIO(), io.StringIO(), 0
-    before = sys.argv, [*sys.path], sys.modules["__main__"]
+    before = sys.argv, [*sys.path], sys.excepthook
     try:
         with redirect_stdout(out), redirect_stderr(err):
             main([*map(str, argv)])
     except SystemExit as exit_:
         code = exit_.code
     finally:
-        sys.argv, sys.path[:], sys.modules["__main__"] = before
+        sys.argv, sys.path[:], sys.excepthook = before
     assert (code == 0) == ok, out.getvalue() + err.getvalue()
     return SimpleNamespace(returncode=code, stdout=out.getvalue(), stderr=err.getvalue())
 

@@ -1,6 +1,7 @@
 """A vector env small enough to count by hand, and a recipe on it."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,7 +13,7 @@ from tensordict.nn import TensorDictModule
 from torchrl.data import Bounded, Composite, Unbounded
 
 from pgkit import run
-from pgkit.run.settings import RunArgs
+from pgkit.run import Agent, RunArgs
 
 
 class CountingArrays:
@@ -54,6 +55,19 @@ class CountingEnv:
         self.arrays.seed = seed % 100
 
     def close(self) -> None: ...
+
+
+@dataclass
+class CountingArgs(RunArgs):
+    """The settings of a recipe with an environment of its own."""
+
+    def make_env(self, num_envs: int, seed: int, workers: int = 1) -> Any:
+        return CountingEnv(num_envs, seed)
+
+
+def agent(args: CountingArgs, env: CountingEnv) -> Agent:
+    """What :func:`train` trains."""
+    return Agent(linear_policy(1.0))
 
 
 class Counter:
@@ -100,4 +114,6 @@ def train(
 
 @pytest.fixture
 def kit() -> SimpleNamespace:
-    return SimpleNamespace(Env=CountingEnv, Counter=Counter, policy=linear_policy, train=train)
+    return SimpleNamespace(
+        Args=CountingArgs, Env=CountingEnv, Counter=Counter, policy=linear_policy, agent=agent, train=train
+    )

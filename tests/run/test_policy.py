@@ -13,7 +13,7 @@ from pgkit.errors import UserError
 
 @pytest.fixture
 def run_dir(kit: SimpleNamespace, tmp_path: Path) -> Path:
-    args = run.RunArgs(env_id="Fake-v0", run_dir=tmp_path / "r", total_frames=20, eval_every=10)
+    args = kit.Args(env_id="Fake-v0", run_dir=tmp_path / "r", total_frames=20, eval_every=10)
     policy = kit.policy(weight=0.25)
     with run.Run(args, "walk") as log:
         log.track(policy=policy, eval_env=kit.Env)
@@ -24,22 +24,22 @@ def run_dir(kit: SimpleNamespace, tmp_path: Path) -> Path:
     return tmp_path / "r"
 
 
-def test_one_observation_or_a_batch(run_dir: Path):
-    policy = run.load_policy(run_dir, "latest")
+def test_one_observation_or_a_batch(kit: SimpleNamespace, run_dir: Path):
+    policy = run.load_policy(run_dir, "latest", agent=kit.agent)
     assert policy.frames == 20
     np.testing.assert_array_equal(policy.predict(np.array([0.5, 1.0])), [0.75])
     np.testing.assert_array_equal(policy.predict(np.array([[0.5, 1.0], [-0.5, 0.0]])), [[0.75], [-0.25]])
 
 
-def test_actions_are_clipped_to_the_bounds(run_dir: Path):
-    policy = run.load_policy(str(run_dir), "latest")
+def test_actions_are_clipped_to_the_bounds(kit: SimpleNamespace, run_dir: Path):
+    policy = run.load_policy(str(run_dir), "latest", agent=kit.agent)
     np.testing.assert_array_equal(policy.predict(np.array([[9.0, 9.0], [-9.0, 0.0]])), [[1.0], [-1.0]])
 
 
-def test_best_and_latest_are_different_weights(run_dir: Path):
+def test_best_and_latest_are_different_weights(kit: SimpleNamespace, run_dir: Path):
     obs = np.array([0.5, 0.5])
-    assert run.load_policy(run_dir, "best").predict(obs) == 0.25
-    assert run.load_policy(run_dir, "latest").predict(obs) == 0.5
+    assert run.load_policy(run_dir, "best", agent=kit.agent).predict(obs) == 0.25
+    assert run.load_policy(run_dir, "latest", agent=kit.agent).predict(obs) == 0.5
 
 
 def test_the_entries_of_a_dict():
@@ -51,9 +51,9 @@ def test_the_entries_of_a_dict():
         policy.predict({"a": np.ones(2)})
 
 
-def test_a_wrong_shape_and_a_wrong_directory(run_dir: Path, tmp_path: Path):
+def test_a_wrong_shape_and_a_wrong_directory(kit: SimpleNamespace, run_dir: Path, tmp_path: Path):
     with pytest.raises(UserError, match=r"shape \[3\]; the policy takes \[2\]"):
-        run.load_policy(run_dir).predict(np.zeros(3))
+        run.load_policy(run_dir, agent=kit.agent).predict(np.zeros(3))
     with pytest.raises(UserError, match="not a run directory"):
         run.load_policy(tmp_path)
 

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import torch
 
-from pgkit import envs, run
-from pgkit.errors import UserError
-from pgkit.run import RunArgs, checkpoint, directory
+from pgkit import envs, files, run
+from pgkit.errors import Diverged, UserError
+from pgkit.run import RunArgs, directory
 from pgkit.run.metrics import averages
 
 Row = dict[str, str]
@@ -43,7 +43,7 @@ def test_a_run_leaves_what_the_design_promises(kit: SimpleNamespace, tmp_path: P
     assert summary["frames"] == 40 and summary["rollout/ep_rew_mean"] == 25.0 and summary["time/fps"] > 0
     assert str(summary["eval/mean_reward"]) == rows(path)[-1]["eval/mean_reward"]
     assert (path / "curve.png").read_bytes()[:4] == b"\x89PNG"
-    assert sorted(p.name for p in (path / "checkpoints").iterdir()) == ["best.pt", "latest.pt", "policy.pt"]
+    assert sorted(p.name for p in (path / "checkpoints").iterdir()) == ["best.pt", "latest.pt"]
     out = capsys.readouterr().out
     assert out.count("frames/s") == 2  # one line an evaluation on a pipe
     for command in (f"--resume {path} --total-frames 80", f"pgkit eval {path}", f"pgkit plot {path}"):
@@ -114,7 +114,7 @@ def test_rows_logged_after_the_checkpoint_are_dropped_on_resume(kit: SimpleNames
     assert rows(tmp_path / "r") == rows(tmp_path / "whole")
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_ctrl_c_finishes_the_step_saves_and_can_be_resumed(
     kit: SimpleNamespace, tmp_path: Path, capsys: Any, number: signal.Signals
 ):
@@ -175,7 +175,7 @@ def test_a_directory_with_a_run_is_refused_and_stays_as_it_is(kit: SimpleNamespa
     [
         ({"recipe": "other"}, "holds a run of walk, not of other"),
         ({"total": 40}, "already trained 40 frames"),
-        ({"extra": {"second": torch.nn.Linear(1, 1)}}, "this recipe tracks counter, policy, second"),
+        ({"extra": {"second": torch.nn.Linear(1, 1)}}, "this recipe tracks agent, counter, second"),
     ],
 )
 def test_a_resume_that_cannot_work_writes_nothing(
@@ -207,12 +207,14 @@ def test_a_run_without_a_checkpoint_cannot_be_resumed(kit: SimpleNamespace, tmp_
 
 
 def test_a_run_that_diverges_says_so_once(kit: SimpleNamespace, tmp_path: Path, caplog: pytest.LogCaptureFixture):
-    from pgkit.run import Run
+    def diverge() -> None:
+        with run.Run(arguments(tmp_path / "r"), "walk") as log:
+            log.track(policy=kit.policy(), eval_env=kit.Env)
+            for frames in (10, 20, 30):
+                log.step(frames, None, {"loss_actor": 1.0 if frames < 20 else float("nan")})
 
-    with Run(arguments(tmp_path / "r"), "walk") as log:
-        log.track(policy=kit.policy(), eval_env=kit.Env)
-        for frames in (10, 20, 30):
-            log.step(frames, None, {"loss_actor": 1.0 if frames < 20 else float("nan")})
+    with pytest.raises(Diverged, match=r"train/loss_actor is not finite at the end \(30 frames\)"):
+        diverge()
     said = [record.getMessage() for record in caplog.records]
     assert len(said) == 1 and said[0].startswith("train/loss_actor is nan at 20 frames: the training has diverged")
 
@@ -265,14 +267,14 @@ def test_a_run_resumed_from_python_keeps_its_settings(kit: SimpleNamespace, tmp_
 
 def test_a_kill_between_two_files_loses_no_best_policy(kit: SimpleNamespace, tmp_path: Path, monkeypatch: Any):
     def killed(path: Path, content: Any) -> None:
-        if saved and path.name != "policy.pt":
+        if saved:
             raise KeyboardInterrupt
-        saved.extend([path.name] if path.name != "policy.pt" else [])
+        saved.append(path.name)
         save(path, content)
 
-    save, saved = checkpoint.save, []
+    save, saved = files.save, []
     with monkeypatch.context() as patch:
-        patch.setattr("pgkit.run.checkpoint.save", killed)
+        patch.setattr("pgkit.files.save", killed)
         with pytest.raises(KeyboardInterrupt):
             kit.train(arguments(tmp_path / "r"))
     assert saved == ["best.pt"]  # of the two, latest comes last: it says that there is a best
@@ -299,3 +301,90 @@ def test_a_run_that_ends_before_its_first_row_leaves_no_directory(kit: SimpleNam
             _ = 1 / 0
         assert path.exists() == kept
         assert not (path / "config.json").exists()
+
+
+def test_a_step_returns_its_row_evaluation_included(kit: SimpleNamespace, tmp_path: Path):
+    with run.Run(arguments(tmp_path / "r"), "walk") as log:
+        log.track(policy=kit.policy(), eval_env=kit.Env)
+        first, second = log.step(10, None, {"x": 1.0}), log.step(20)
+        assert log.step(21, every=10) == {}
+    assert first["frames"] == 10 and first["train/x"] == 1.0 and "eval/mean_reward" not in first
+    assert str(second["eval/mean_reward"]) == rows(tmp_path / "r")[1]["eval/mean_reward"]
+
+
+def test_compile_seconds_of_what_is_tracked_do_not_count(kit: SimpleNamespace, tmp_path: Path, monkeypatch: Any):
+    class Compiled(kit.Counter):
+        compile_seconds = 0.0
+
+    update, collector = Compiled(), Compiled()
+    with run.Run(arguments(tmp_path / "r"), "walk") as log:
+        log.track(policy=kit.policy(), eval_env=kit.Env, update=update, collector=collector)
+        asked: list[float] = []
+        monkeypatch.setattr(log._clock, "fps", lambda frames, seconds: asked.append(seconds) or 1.0)
+        log.step(10)
+        update.compile_seconds, collector.compile_seconds = 3.0, 0.5
+        log.step(20)
+        log.step(30, compile_seconds=7.0)
+    assert asked == [0.0, 3.5, 7.0]
+
+
+def test_an_error_saves_what_was_trained_first(kit: SimpleNamespace, tmp_path: Path, caplog: Any, capsys: Any):
+    def crash(frames: int) -> None:
+        if frames == 30:
+            raise ZeroDivisionError("the environment's")
+
+    kit.train(arguments(tmp_path / "whole"))
+    with pytest.raises(ZeroDivisionError):
+        kit.train(arguments(tmp_path / "r"), hook=crash)
+    assert files.load(tmp_path / "r" / "checkpoints" / "latest.pt")["frames"] == 30
+    assert f"the run ends at an error; {tmp_path / 'r'} has the checkpoint of 30 frames" in caplog.text
+    kit.train(arguments(tmp_path / "r", resume=tmp_path / "r"))
+    assert rows(tmp_path / "r") == rows(tmp_path / "whole")
+
+
+def test_an_error_amid_an_update_keeps_the_checkpoint_before(kit: SimpleNamespace, tmp_path: Path, caplog: Any):
+    class Update(kit.Counter):
+        def __call__(self) -> None:
+            self.frames += 10
+            _ = 1 / (30 - self.frames)
+
+    with pytest.raises(ZeroDivisionError), run.Run(arguments(tmp_path / "r"), "walk") as log:
+        update = Update()
+        log.track(policy=kit.policy(), eval_env=kit.Env, update=update)
+        while True:
+            update()
+            log.step(update.frames)
+    assert files.load(tmp_path / "r" / "checkpoints" / "latest.pt")["states"]["update"] == {"frames": 20}
+    assert "the checkpoint of 20 frames (the error came in the middle of an update)" in caplog.text
+
+
+def test_an_exit_from_within_is_no_success(kit: SimpleNamespace, tmp_path: Path):
+    def leave(frames: int) -> None:
+        raise SystemExit(0)
+
+    with pytest.raises(UserError, match=r"something called sys.exit\(0\) after 10 frames"):
+        kit.train(arguments(tmp_path / "r"), hook=leave)
+    assert files.load(tmp_path / "r" / "checkpoints" / "latest.pt")["frames"] == 10
+
+
+def test_weights_that_are_not_finite_replace_no_checkpoint(kit: SimpleNamespace, tmp_path: Path):
+    policy = kit.policy(1.0)
+    with (
+        pytest.raises(Diverged, match="not finite at 40 frames: .* keeps its checkpoint of 20 frames"),
+        run.Run(arguments(tmp_path / "r"), "walk") as log,
+    ):
+        log.track(policy=policy, eval_env=kit.Env)
+        log.step(20)
+        torch.nn.init.constant_(policy.module.weight, float("nan"))
+        log.step(40)
+    latest = files.load(tmp_path / "r" / "checkpoints" / "latest.pt")
+    assert latest["frames"] == 20 and latest["states"]["agent"]["parts"]["actor"]["module.weight"].tolist() == [[1, 1]]
+
+
+def test_a_hangup_that_nohup_ignores_stays_ignored(kit: SimpleNamespace, tmp_path: Path):
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        kit.train(arguments(tmp_path / "r"), hook=lambda _: os.kill(os.getpid(), signal.SIGHUP))
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    assert len(rows(tmp_path / "r")) == 4

@@ -7,14 +7,16 @@ from pathlib import Path
 import pytest
 
 from pgkit.errors import UserError
+from pgkit.run import setting
+from pgkit.run.args import free_on_resume
 from pgkit.run.settings import RunArgs, check, launch, parse
 
 
 @dataclass
 class Args(RunArgs):
-    learning_rate: float = 3e-4
+    learning_rate: float = setting(3e-4, low=0)
     """Step size."""
-    hidden: tuple[int, ...] = (64, 64)
+    hidden: tuple[int, ...] = setting((64, 64), low=1)
     """Widths."""
 
 
@@ -128,8 +130,11 @@ def test_launch_lets_other_errors_through_and_ctrl_c_exits_130():
     [
         ("--total-frames many", "Error parsing --total-frames: invalid literal for int() with base 10: 'many'"),
         ("--compile maybe", "invalid choice 'maybe' for argument '--compile'. Expected one of ('auto', 'on', 'off')."),
-        ("--wokers 3", "Unrecognized options: --wokers, 3; the nearest are --workers"),
+        ("--wokers 3", "Unrecognized options: --wokers; the nearest are --workers"),
         ("CartPole-v1", "Unrecognized options: CartPole-v1; did you mean --env-id CartPole-v1?"),
+        ("--lr 0.1", "Unrecognized options: --lr; the nearest are --learning-rate"),
+        ("--frames=3", "Unrecognized options: --frames; the nearest are --total-frames"),
+        ("--env.continuous --seed 3", "--env.continuous: give a value, as in --env.continuous True"),
     ],
 )
 def test_a_bad_flag_is_one_line_and_exits_2(capsys: pytest.CaptureFixture[str], words: str, message: str):
@@ -137,7 +142,7 @@ def test_a_bad_flag_is_one_line_and_exits_2(capsys: pytest.CaptureFixture[str], 
         launch(lambda args: None, Args, argv=words.split())
     assert exit_.value.code == 2
     error = capsys.readouterr().err
-    assert error.startswith(f"error: {message} (see pgkit run ") and error.endswith(" --help)\n")
+    assert error.startswith(f"error: {message}") and (error.endswith(" --help)\n") or "--env." in words)
     assert error.count("\n") == 1
 
 
@@ -157,7 +162,7 @@ def test_whole_numbers_may_have_an_exponent():
 
 
 @pytest.mark.parametrize(
-    ("setting", "message"),
+    ("given", "message"),
     [
         ({"hidden": (64, 0)}, "--hidden 0: give at least 1"),
         ({"learning_rate": -1.0}, "--learning-rate -1.0: give at least 0"),
@@ -168,32 +173,36 @@ def test_whole_numbers_may_have_an_exponent():
         ({"learning_rate": float("inf")}, "--learning-rate inf: give a finite number"),
         ({"log_std": float("nan")}, "--log-std nan: give a finite number"),
         ({"max_grad_norm": 0.0}, "--max-grad-norm 0.0: give a number above 0"),
+        ({"old_rollouts": 2**63}, "--old-rollouts 9223372036854775808: give at most 4.6"),
+        ({"threads": 1_000_000}, "--threads 1000000: give at most 256"),
     ],
 )
-def test_numbers_that_no_run_can_have(setting: dict, message: str):
+def test_numbers_that_no_run_can_have(given: dict, message: str):
     @dataclass
     class Discounted(Args):
-        gamma: float | None = None
-        old_rollouts: int = 3
-        log_std: float = -0.5  # a setting that pgkit has no bounds for
-        max_grad_norm: float | None = None
+        gamma: float | None = setting(None, low=0, high=1)
+        old_rollouts: int = setting(3, low=0)
+        log_std: float = -0.5  # a setting without bounds
+        max_grad_norm: float | None = setting(None, above=0)
+        learning_rate: float = 0.5  # another default, the same bounds
 
     check(Discounted())
     with pytest.raises(UserError, match=message):
-        check(Discounted(**setting))
+        check(Discounted(**given))
+
+
+@dataclass
+class Annealed(Args):
+    anneal: bool = setting(True, follows="total_frames")
 
 
 def test_a_stretched_annealing_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    @dataclass
-    class Annealed(Args):
-        anneal: bool = True
-
     settings = {"env_id": "X-v0", "total_frames": 1000, "anneal": True}
     (tmp_path / "config.json").write_text(json.dumps({"recipe": "walk", "settings": settings}))
     parse(Annealed, {}, ["--resume", str(tmp_path)])
     assert capsys.readouterr().out == ""
     parse(Annealed, {}, ["--resume", str(tmp_path), "--total-frames", "2000"])
-    assert "anneals to zero at 2,000, no longer 1,000 frames" in capsys.readouterr().out
+    assert "--anneal ends at 2,000 frames, no longer at 1,000: it jumps" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -209,6 +218,7 @@ def test_other_settings_are_refused_on_resume(tmp_path: Path, recipe: str, flag:
     args_class = importlib.import_module(f"recipes.{recipe}").Args
     settings = {key: value for key, value in dataclasses.asdict(args_class()).items() if key != "run_dir"}
     run_dir = saved_run(tmp_path / "run", **settings)
+    assert not {name for name in ("learning_rate", "anneal", "gamma") if name in free_on_resume(args_class)}
     with pytest.raises(UserError, match=f"{flag} 0.77: a resumed run keeps its own"):
         parse(args_class, {}, ["--resume", str(run_dir), flag, "0.77"])
 
@@ -218,3 +228,53 @@ def test_a_resumed_run_keeps_its_settings_and_may_go_on_longer(tmp_path: Path):
     with pytest.raises(UserError, match="--learning-rate 0.1: a resumed run keeps its own, 0.5"):
         parse(Args, {}, ["--resume", str(run_dir), "--learning-rate", "0.1"])
     assert parse(Args, {}, ["--resume", str(run_dir), "--learning-rate", "0.5", "--eval-every", "7"]).eval_every == 7
+
+
+def test_keywords_of_the_environment_are_kept_and_stay_on_a_resume(tmp_path: Path):
+    words = ["--env.continuous", "True", "--env.max-episode-steps=500", "--seed", "3", "--env.name", "a b"]
+    args = parse(Args, {}, words)
+    assert args.env == {"continuous": True, "max_episode_steps": 500, "name": "a b"} and args.seed == 3
+    run_dir = saved_run(tmp_path / "r", env_id="X-v0", env=args.env)
+    assert parse(Args, {}, ["--resume", str(run_dir), "--env.continuous", "True"]).env == args.env
+    with pytest.raises(UserError, match="--env .*: a resumed run keeps its own"):
+        parse(Args, {}, ["--resume", str(run_dir), "--env.continuous", "False"])
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"num_envs": "8"},
+        {"env": []},
+        {"hidden": ["a"]},
+        {"compile": "maybe"},
+        {"seed": 1.5},
+        {"explain": 1},
+        {"env_id": 3},
+    ],
+)
+def test_settings_of_another_type_are_damage(tmp_path: Path, settings: dict):
+    run_dir = saved_run(tmp_path / "r", **settings)
+    with pytest.raises(UserError, match=f"config.json is damaged: its {next(iter(settings))} is "):
+        parse(Args, {}, ["--resume", str(run_dir)])
+
+
+def test_one_command_begins_and_goes_on(tmp_path: Path):
+    words = ["--env-id", "X-v0", "--run-dir", str(tmp_path / "r"), "--resume-if-possible", "--learning-rate", "0.5"]
+    args = parse(Args, {}, words)
+    assert args.resume is None and args.run_dir == tmp_path / "r"
+    saved_run(tmp_path / "r", env_id="X-v0", learning_rate=0.5, resume_if_possible=True)
+    assert parse(Args, {}, words).resume is None  # nothing was saved yet
+    (tmp_path / "r" / "checkpoints").mkdir()
+    (tmp_path / "r" / "checkpoints" / "latest.pt").touch()
+    assert parse(Args, {}, words).resume == tmp_path / "r"
+
+
+def test_a_module_that_a_run_directory_names_is_imported_only_where_it_is_given_or_trusted(tmp_path: Path):
+    run_dir = saved_run(tmp_path / "r", env_id="evil:X-v0", wrapper="evil:wrap")
+    words = ["--resume", str(run_dir)]
+    with pytest.raises(UserError, match="names code to import, --env-id evil:X-v0"):
+        parse(Args, {}, words)
+    with pytest.raises(UserError, match="names code to import, --wrapper evil:wrap"):
+        parse(Args, {}, [*words, "--env-id", "evil:X-v0"])
+    assert parse(Args, {}, [*words, "--trust"]).wrapper == "evil:wrap"
+    assert parse(Args, {}, [*words, "--env-id", "evil:X-v0", "--wrapper", "evil:wrap"]).trust is False
