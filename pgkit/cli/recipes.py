@@ -68,6 +68,22 @@ def find(recipe: str) -> Path:
     return recipes_dir() / f"{recipe}.py"
 
 
+def look_beside(file: Path) -> None:
+    """Lets a recipe import the modules beside it, if it does; last on the path, they hide no installed one."""
+    tree = ast.parse(file.read_text(encoding="utf-8"))
+    names = {alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names}
+    names |= {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.module}
+    for name in {name.partition(".")[0] for name in names}:
+        look_in(file.resolve().parent, name)
+
+
+def look_in(folder: Path, module: str) -> None:
+    """Lets a module be imported from this folder, if it is there and nowhere else."""
+    here = module.isidentifier() and ((folder / f"{module}.py").is_file() or (folder / module).is_dir())
+    if here and str(folder) not in sys.path and importlib.util.find_spec(module) is None:
+        sys.path.append(str(folder))
+
+
 def load(path: Path) -> ModuleType:
     """The recipe in this file, imported.
 
@@ -75,8 +91,9 @@ def load(path: Path) -> ModuleType:
         UserError: it has no ``main`` and ``Args``.
     """
     path = path.resolve()
-    if str(path.parent) not in sys.path:
-        sys.path.append(str(path.parent))  # worker processes import it by its name; last, it hides no other module
+    look_beside(path)
+    if is_shipped(path) and str(path.parent) not in sys.path:
+        sys.path.append(str(path.parent))  # workers import the recipe's classes by its name
     name = path.stem if _own_name(path) else f"{path.stem}_recipe"
     spec: Any = importlib.util.spec_from_file_location(name, path)
     module = sys.modules[name] = importlib.util.module_from_spec(spec)

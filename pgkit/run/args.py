@@ -5,8 +5,6 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import math
-import os
-import sys
 import types
 import typing
 from collections.abc import Callable
@@ -20,6 +18,7 @@ import torch
 import tyro
 
 from pgkit import envs
+from pgkit.cli import recipes
 from pgkit.errors import UserError
 
 
@@ -90,8 +89,8 @@ class RunArgs:
 
     def make_env(self, num_envs: int, seed: int, workers: int = 1) -> envs.VectorEnv:
         """The environment of these settings; a recipe with another kind of environment overrides this."""
-        if self.imports():
-            allow_imports_from_here()
+        for name in self.imports():
+            recipes.look_in(Path.cwd(), name.split()[1].partition(":")[0].partition(".")[0])
         make, keywords = self.env_id, dict(self.env)
         if self.wrapper is not None:
             by_gymnasium = not self.env_id.startswith(("dm_control/", "dmc:"))
@@ -117,12 +116,6 @@ def placed(args: RunArgs) -> torch.device:
     if args.device == "cuda" and not torch.cuda.is_available():
         raise UserError("--device cuda: PyTorch finds no GPU here; --device auto takes the CPU then")
     return torch.device("cuda" if args.device != "cpu" and torch.cuda.is_available() else "cpu")
-
-
-def allow_imports_from_here() -> None:
-    """Modules of the working directory can be imported; last on the path, they hide no other."""
-    if (here := os.getcwd()) not in sys.path:
-        sys.path.append(here)
 
 
 def imported(name: str) -> Callable[[gym.Env], gym.Env]:

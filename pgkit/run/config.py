@@ -58,8 +58,11 @@ def write_config(path: Path, args: RunArgs, recipe: str, before: dict[str, Any] 
 def read_config(path: Path) -> dict[str, Any]:
     """``config.json`` of a run directory; a UserError if there is none, or if it is damaged."""
     file = path / "config.json"
-    if not file.is_file():
-        raise UserError(f"{path} is not a run directory: it has no config.json")
+    try:
+        if not file.is_file():
+            raise UserError(f"{path} is not a run directory: it has no config.json")
+    except OSError as error:
+        raise UserError(f"{path} is not a run directory: {error.strerror}") from error
     config = read_json(file)
     if not isinstance(config, dict) or not isinstance(config.get("recipe"), str) or "settings" not in config:
         raise UserError(f"{file} is damaged: it names no recipe and settings")
