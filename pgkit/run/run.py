@@ -371,7 +371,11 @@ class Run:
 
     def _finish(self) -> None:
         if self._evaluated.get("frames") != self.frames:
-            scores = self._evaluate({})
+            try:
+                scores = self._evaluate({})
+            except BaseException:
+                self.save()
+                raise
             self._metrics.write({"frames": self.frames, "time/wall_s": self._clock.wall, **scores})
         if self._saved_at != self.frames:
             self.save()

@@ -291,6 +291,13 @@ def test_an_error_in_the_user_s_code_is_one_line_and_the_user_s_own_frames(tmp_p
     assert "run.py" not in done.stderr and "site-packages" not in done.stderr and "Traceback" not in done.stderr
 
 
+def test_an_error_in_pgkit_or_below_shows_every_frame(tmp_path: Path):
+    (tmp_path / "walk.py").write_text(RECIPE.replace("log.step(frames)", "log.step(frames, None, 3)"))
+    done = pgkit("run", "walk.py", "--run-dir", "r", "--total-frames", "40", cwd=tmp_path)
+    assert done.returncode == 1 and "error: " in done.stderr
+    assert "metrics.py" in done.stderr and "walk.py" in done.stderr
+
+
 def test_a_reader_that_goes_away_is_no_error(trained: Path):
     code = "from pgkit.cli.main import main; main(['ls'])"
     with subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as ls:
