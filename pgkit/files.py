@@ -30,7 +30,6 @@ def replacing(path: Path) -> Iterator[IO[bytes]]:
     """
     part = path.with_name(f".{path.name}.part")
     try:
-        path.parent.mkdir(exist_ok=True)
         part.unlink(missing_ok=True)  # of a process that was killed; a link is removed, never followed
         with open(part, "xb") as file:
             yield file

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from pgkit.cli import recipes
+from pgkit.cli.beside import look_beside
 from pgkit.cli.exits import exits
 from pgkit.errors import UserError
 
@@ -113,7 +114,7 @@ def run_recipe(args: argparse.Namespace) -> None:
     path = recipes.find(args.recipe)
     if not recipes.is_shipped(path):  # as `python FILE` runs it, but what lies beside it hides no other module
         sys.argv = [args.recipe, *args.flags]
-        recipes.look_beside(path)
+        look_beside(path)
         runpy.run_path(str(path), run_name="__main__")
         return
     recipe = recipes.load(path)

@@ -8,6 +8,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from pgkit.cli.beside import look_beside
 from pgkit.errors import UserError
 
 
@@ -66,22 +67,6 @@ def find(recipe: str) -> Path:
         close = ", ".join(difflib.get_close_matches(recipe, known, cutoff=0.3) or known)
         raise UserError(f"no recipe named {recipe}; nearest: {close} (pgkit ls lists all; a file ends in .py)")
     return recipes_dir() / f"{recipe}.py"
-
-
-def look_beside(file: Path) -> None:
-    """Lets a recipe import the modules beside it, if it does; last on the path, they hide no installed one."""
-    tree = ast.parse(file.read_text(encoding="utf-8"))
-    names = {alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names}
-    names |= {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.module}
-    for name in {name.partition(".")[0] for name in names}:
-        look_in(file.resolve().parent, name)
-
-
-def look_in(folder: Path, module: str) -> None:
-    """Lets a module be imported from this folder, if it is there and nowhere else."""
-    here = module.isidentifier() and ((folder / f"{module}.py").is_file() or (folder / module).is_dir())
-    if here and str(folder) not in sys.path and importlib.util.find_spec(module) is None:
-        sys.path.append(str(folder))
 
 
 def load(path: Path) -> ModuleType:

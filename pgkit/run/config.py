@@ -24,7 +24,8 @@ from pgkit.run.args import RunArgs, free_on_resume, of_type
 
 A = TypeVar("A", bound=RunArgs)
 PACKAGES = ("pgkit", "torch", "torchrl", "tensordict", "numpy", "gymnasium", "mujoco", "dm-control", "shimmy")
-_SHAPE = {"settings": dict, "command": list, "resumed_at": list, "id": str, "may_change": list}
+_TEXT = (str, type(None))
+_KINDS = {"settings": dict, "command": list, "resumed_at": list, "id": str, "may_change": list, "file": _TEXT}
 
 
 def write_config(path: Path, args: RunArgs, recipe: str, before: dict[str, Any] | None, identity: str) -> None:
@@ -66,9 +67,9 @@ def read_config(path: Path) -> dict[str, Any]:
     config = read_json(file)
     if not isinstance(config, dict) or not isinstance(config.get("recipe"), str) or "settings" not in config:
         raise UserError(f"{file} is damaged: it names no recipe and settings")
-    for key, kind in _SHAPE.items():
+    for key, kind in _KINDS.items():
         if key in config and not isinstance(config[key], kind):
-            raise UserError(f"{file} is damaged: its {key} is no {kind.__name__}")
+            raise UserError(f"{file} is damaged: its {key} is {config[key]!r:.60}")
     if not isinstance(config["settings"].get("env_id", ""), str):
         raise UserError(f"{file} is damaged: its env_id is no text")
     return config

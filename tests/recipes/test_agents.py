@@ -5,13 +5,15 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from pgkit import files, run
+from pgkit import envs, files, run
 from pgkit.cli import recipes
+from pgkit.errors import UserError
 from pgkit.run.args import told
 from tests.recipes.test_ppo import pgkit, rows
 
@@ -55,6 +57,17 @@ def test_an_agent_is_built_again_and_loaded(tmp_path: Path, name: str, settings:
     for mine, theirs in zip(trained.loss.state_dict().values(), fresh.loss.state_dict().values(), strict=True):
         assert not torch.is_tensor(mine) or torch.equal(mine, theirs)
     env.close()
+
+
+class Picture(gym.Env):
+    observation_space, action_space = gym.spaces.Box(0, 255, (96, 96, 3), np.uint8), gym.spaces.Discrete(2)
+
+
+@pytest.mark.parametrize("name", ["dqn", "rainbow"])
+def test_a_picture_is_no_vector(name: str):
+    recipe = recipes.load(recipes.find(name))
+    with pytest.raises(UserError, match=rf"{name} reads vectors, an observation of 'CartPole-v1' is \[96, 96, 3\]"):
+        recipe.agent(recipe.Args(), envs.make(Picture))
 
 
 @pytest.mark.parametrize("name", recipes.names())
