@@ -75,7 +75,7 @@ def agent(args: Args, env: EnvBase) -> run.Agent:
         raise UserError(f"dqn needs one discrete action, '{args.env_id}' has another action space: use sac or td3")
     shape = env.observation_spec_unbatched["observation"].shape
     if len(shape) != 1:
-        raise UserError(f"dqn reads vectors, an observation of '{args.env_id}' is {list(shape)}: flatten it, --wrapper")
+        raise UserError(f"dqn reads vectors, an observation of '{args.env_id}' is {list(shape)}: flatten it")
     sizes = (shape[0], actions)
     net = modules.mlp(*sizes, args.hidden, torch.nn.ReLU)
     actor = QValueActor(net, in_keys=["observation"], action_space="categorical")

@@ -105,7 +105,7 @@ def agent(args: Args, env: EnvBase) -> run.Agent:
     shape = env.observation_spec_unbatched["observation"].shape
     if len(shape) != 1:
         raise UserError(
-            f"rainbow reads vectors, an observation of '{args.env_id}' is {list(shape)}: flatten it, --wrapper"
+            f"rainbow reads vectors, an observation of '{args.env_id}' is {list(shape)}: flatten it"
         )
     sizes = (shape[0], actions)
     net = DuelingNoisyNet(*sizes, args.atoms, args.hidden, args.noise)
