@@ -29,10 +29,7 @@ _KINDS = {"settings": dict, "command": list, "resumed_at": list, "id": str, "may
 
 
 def write_config(path: Path, args: RunArgs, recipe: str, before: dict[str, Any] | None, identity: str) -> None:
-    """Write ``config.json``; ``before`` is that of the run that goes on, with the frames of each resume.
-
-    A new run claims the directory by creating the file; if another run got there first this is a UserError.
-    """
+    """Write ``config.json``; ``before`` is that of the run that goes on, with the frames of each resume."""
     config = {
         "recipe": recipe,
         "file": recipe_file(type(args)),
@@ -45,14 +42,6 @@ def write_config(path: Path, args: RunArgs, recipe: str, before: dict[str, Any] 
         "resumed_at": before["resumed_at"] if before else [],
         "id": identity,
     }
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-        if before is None:
-            (path / "config.json").touch(exist_ok=False)
-    except FileExistsError:
-        raise UserError(f"{path} already holds a run: give another --run-dir") from None
-    except OSError as error:
-        raise UserError(f"--run-dir {path} cannot be made: {error.strerror}") from error
     write_json(path / "config.json", config)
 
 

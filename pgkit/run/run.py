@@ -79,8 +79,6 @@ class Run:
         self._lock: int | None = None
 
     def __enter__(self) -> Run:
-        torch.set_num_threads(self.args.threads)
-        seeding.seed_everything(self.args.seed)
         if self.args.resume:
             self._lock = directory.lock(self.dir)  # before it reads: another process may be further
             try:
@@ -88,6 +86,8 @@ class Run:
             except BaseException:
                 directory.unlock(self._lock)
                 raise
+        torch.set_num_threads(self.args.threads)
+        seeding.seed_everything(self.args.seed)
         self._handlers: dict[signal.Signals, Any] = {}
         if threading.current_thread() is threading.main_thread():
             heard = [s for s in SIGNALS if s.name == "SIGINT" or signal.getsignal(s) != signal.SIG_IGN]  # nohup ignores
@@ -101,7 +101,8 @@ class Run:
         config.as_resumed(self.args, self.dir)
         theirs, mine = before.get("file"), config.recipe_file(type(self.args))
         if theirs != mine:
-            _log.warning("%s is a run of %s, this is %s: is it the same?", self.dir, theirs or "pgkit's recipe", mine)
+            names = (file or f"pgkit's {self.recipe}" for file in (theirs, mine))
+            _log.warning("%s is a run of %s, this is %s: is it the same?", self.dir, *names)
         saved = checkpoint.load(resume if resume.suffix == ".pt" else resume / "checkpoints" / "latest.pt")
         if self.args.total_frames <= saved["frames"]:
             if self.args.resume_if_possible:
@@ -173,12 +174,10 @@ class Run:
             folder = self.args.init / "checkpoints"
             path = folder / ("best.pt" if (folder / "best.pt").exists() else "latest.pt")
             checkpoint.restore({"agent": self._agent}, {"agent": checkpoint.load(path)["states"].get("agent")}, path)
-        if not self._saved and directory.holds_run(self.dir):  # and has saved nothing: this run takes its place
-            self._lock = directory.lock(self.dir)
-            directory.clear(self.dir)
+        if not self._saved:
+            self._lock = directory.claim(self.dir, self.args, self.recipe)
+            self._claimed = True
         config.write_config(self.dir, self.args, self.recipe, before, identity)
-        self._claimed = not self._saved
-        self._lock = self._lock if self._lock is not None else directory.lock(self.dir)
         self._metrics = Metrics(self.dir, upto=self.frames, identity=identity)
 
     def step(
