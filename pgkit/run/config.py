@@ -101,7 +101,7 @@ def recipe_target(args_class: type[RunArgs], recipe: str = "") -> str:
     """What ``pgkit run`` takes to run this recipe again: its file, or a shipped name."""
     file = recipe_file(args_class)
     if file is None:
-        return recipe or args_class.__module__.rpartition(".")[2]
+        return recipe or Path(vars(sys.modules[args_class.__module__]).get("__file__") or args_class.__module__).stem
     here = Path.cwd()
     return shlex.quote(str(Path(file).relative_to(here) if Path(file).is_relative_to(here) else file))
 
