@@ -8,7 +8,7 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 PGKIT = ROOT / "pgkit"
-FREE = {"torch", "tensordict", "errors", "seams"}
+FREE = {"torch", "tensordict", "errors", "seams", "files"}
 MAY_IMPORT = {
     "functional": set(),
     "heads": {"functional"},
