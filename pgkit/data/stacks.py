@@ -22,7 +22,7 @@ def check(frame_stack: Mapping[Key, int] | int | None, observation: Entries, ste
             raise UserError(f"frame_stack={frame_stack}: say of which of {', '.join(map(str, observation))}, as a dict")
         frame_stack = dict.fromkeys(observation, frame_stack)
     for key, k in (frame_stack or {}).items():
-        whole(1, **{f"frame_stack[{key!r}]": k})
+        check_whole_number(1, **{f"frame_stack[{key!r}]": k})
         if key not in observation:
             raise UserError(
                 f"frame_stack: there is no '{key}', the observations are {', '.join(map(str, observation))}"
