@@ -13,7 +13,7 @@ class UserError(ValueError):
     """
 
 
-def whole(least: int, **settings: Any) -> None:
+def check_whole_number(least: int, **settings: Any) -> None:
     """Raises ``UserError`` for a setting that is no whole number, or below ``least``; None passes."""
     for name, value in settings.items():
         if value is not None and (not isinstance(value, Integral) or value < least):

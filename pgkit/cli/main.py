@@ -10,7 +10,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import NoReturn
 
-from pgkit.cli import recipes
+from pgkit.cli import recipes, studies
 from pgkit.errors import UserError
 
 
@@ -24,7 +24,10 @@ class Parser(argparse.ArgumentParser):
 def main(argv: Sequence[str] | None = None) -> None:
     """Run one command: exit 2 and one line on a user's error, 130 on Ctrl-C."""
     try:
-        args = parser().parse_args(argv)
+        args, flags = parser().parse_known_args(argv)
+        if flags and not getattr(args, "takes_flags", False):
+            raise UserError(f"unrecognized arguments: {' '.join(flags)} (see pgkit --help)")
+        args.flags = flags or getattr(args, "flags", [])
         args.command(args)
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
@@ -68,6 +71,7 @@ def parser() -> Parser:
         "--x", choices=["frames", "wall"], default="frames", help="axis: frames, or minutes of training"
     )
     command.set_defaults(command=plot_runs)
+    studies.add(commands)
     return top
 
 

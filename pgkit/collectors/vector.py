@@ -17,7 +17,7 @@ from pgkit.collectors.workers import Workers
 from pgkit.compiled import Constants, choose
 from pgkit.envs import VectorEnv
 from pgkit.envs.arrays import episode_seed
-from pgkit.errors import UserError, whole
+from pgkit.errors import UserError, check_whole_number
 
 
 class VectorCollector:
@@ -56,7 +56,7 @@ class VectorCollector:
         compile: str = "auto",
     ) -> None:
         check_env(env, self)
-        whole(1, frames_per_batch=frames_per_batch)
+        check_whole_number(1, frames_per_batch=frames_per_batch)
         if frames_per_batch % env.num_envs:
             raise UserError(
                 f"frames_per_batch={frames_per_batch} is not a multiple of the {env.num_envs} environments: each takes "

@@ -2,7 +2,6 @@
 
 from pgkit.compiled.constants import Constants
 from pgkit.compiled.door import Compiled, Mode, check_compile, choose, compiled
-from pgkit.compiled.native import computed_once
 from pgkit.compiled.trial import undone
 
-__all__ = ["Compiled", "Constants", "Mode", "check_compile", "choose", "compiled", "computed_once", "undone"]
+__all__ = ["Compiled", "Constants", "Mode", "check_compile", "choose", "compiled", "undone"]

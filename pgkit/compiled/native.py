@@ -13,7 +13,7 @@ from typing import Any, cast
 
 import torch
 from torch import Tensor
-from torch.compiler import is_compiling, is_dynamo_compiling
+from torch.compiler import is_dynamo_compiling
 from torch.fx import GraphModule, Node
 from torch.fx.experimental.proxy_tensor import make_fx
 from torch.fx.subgraph_rewriter import replace_pattern
@@ -28,15 +28,6 @@ _OPTIONS: dict[str, Any] = {
 # sums over a few action dimensions as loops, which are vectorized: written out, every row takes scalar code;
 # C++ around the kernels: Python there costs a small step a quarter of its time
 _CPU_OPTIONS: dict[str, Any] = {"unroll_reductions_threshold": 1, "cpp_wrapper": True}
-
-
-def computed_once(x: Tensor) -> Tensor:
-    """``x`` without gradients, a few numbers that much larger operations read.
-
-    Compiled for a CPU, it is kept in memory: inductor's loops over the larger operations would compute it anew for
-    every vector, and two powers cost more than the rest of Adam.
-    """
-    return torch.ops._inductor_test.realize(x) if is_compiling() and x.device.type == "cpu" else x
 
 
 def record(function: Callable[..., Any], inputs: Sequence[Tensor]) -> GraphModule:

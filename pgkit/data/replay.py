@@ -17,7 +17,7 @@ from torchrl.envs import EnvBase
 from pgkit.data import files
 from pgkit.data.gather import Gather, gather
 from pgkit.data.prioritized import Prioritized
-from pgkit.errors import UserError, whole
+from pgkit.errors import UserError, check_whole_number
 
 
 class ReplayBuffer:
@@ -59,7 +59,7 @@ class ReplayBuffer:
             raise UserError(f"ReplayBuffer(env, capacity): env is a {type(env).__name__}, give what envs.make gives")
         if sampler is not None and (isinstance(sampler, type) or not hasattr(sampler, "write_back")):
             raise UserError(f"sampler={sampler!r}: give data.Prioritized(), or None to draw uniformly")
-        whole(1, capacity=capacity, n_steps=n_steps, final_rows=final_rows)
+        check_whole_number(1, capacity=capacity, n_steps=n_steps, final_rows=final_rows)
         self.columns = env.batch_size.numel()
         if capacity < self.columns:
             raise UserError(

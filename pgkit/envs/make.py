@@ -14,7 +14,7 @@ from torchrl.envs import EnvBase
 
 from pgkit.envs.action_repeat import ActionRepeat
 from pgkit.envs.vector import VectorEnv
-from pgkit.errors import UserError, whole
+from pgkit.errors import UserError, check_whole_number
 
 
 def make(
@@ -54,8 +54,8 @@ def make(
         )
     if seed is None:
         raise UserError("seed=None: give a whole number; numpy.random.randint(2**31) is another in every run")
-    whole(0, seed=seed, num_envs=num_envs, workers=workers)
-    whole(1, action_repeat=action_repeat)
+    check_whole_number(0, seed=seed, num_envs=num_envs, workers=workers)
+    check_whole_number(1, action_repeat=action_repeat)
     if num_envs < 1 or workers < 1 or workers > num_envs:
         raise UserError(
             f"num_envs={num_envs}, workers={workers}: every worker needs at least one environment; "

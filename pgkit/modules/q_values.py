@@ -12,7 +12,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
-from pgkit.errors import UserError, whole
+from pgkit.errors import UserError, check_whole_number
 from pgkit.heads import Head
 from pgkit.modules.bodies import Body, Layers, Norm, ensemble_mlp
 from pgkit.modules.ensemble import EnsembleLinear
@@ -103,7 +103,7 @@ def _layers(
     dropout: float,
     body: Body | None,
 ) -> Layers:
-    whole(1, num_critics=num)
+    check_whole_number(1, num_critics=num)
     if body is not None:
         return body(num, features)
     return ensemble_mlp(num, features, hidden, activation, norm, dropout)

@@ -11,14 +11,13 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
+from pgkit import optim
+from pgkit.checks import LossView, assembly, check_settings, diagram, is_loss
 from pgkit.compiled import check_compile, choose, undone
 from pgkit.data import ReplayBuffer
-from pgkit.errors import UserError, whole, within
+from pgkit.errors import UserError
 from pgkit.seams import Augmentation
-from pgkit.updates import optimizers, wiring
 from pgkit.updates.batches import Batches, OwnBatches, TorchRLBatches
-from pgkit.updates.chain import Chain, is_loss
-from pgkit.updates.diagram import diagram
 from pgkit.updates.minibatches import means
 from pgkit.updates.state import load, save
 from pgkit.updates.step import GradientStep, Grads, grads_of, metrics_of
@@ -87,11 +86,7 @@ class OffPolicyUpdate:
         total_frames: int | None = None,
         compile: str = "auto",
     ) -> None:
-        optimizers.check_optimizer(optimizer)
         check_compile(compile)
-        whole(1, batch_size=batch_size, actor_delay=actor_delay, accumulate=accumulate)
-        within(0, float("inf"), updates_per_step=updates_per_step)
-        _check_sizes(buffer, batch_size, learning_starts, total_frames)
         self.loss, self.buffer, self.optimizer = loss, buffer, optimizer
         self.batch_size, self.updates_per_step, self.actor_delay = batch_size, updates_per_step, actor_delay
         self.delay_targets, self.accumulate, self.augment = delay_targets, accumulate, augment
@@ -100,9 +95,11 @@ class OffPolicyUpdate:
         self.frames = self.updates = 0
         self.between: Callable[[Grads], Grads] | None = None  # changes the gradients before the optimizer's step
         self._due = 0.0
-        self._average, self._copy_statistics = averaging(loss, tau), copying(loss)
         source = OwnBatches if isinstance(buffer, ReplayBuffer) else TorchRLBatches
         self._batches: Batches = source(buffer, loss, batch_size * accumulate)
+        one_tau = None if isinstance(tau, Mapping) else tau
+        check_settings(LossView(loss), vars(self) | {"capacity": self._batches.capacity, "tau": one_tau})
+        self._average, self._copy_statistics = averaging(loss, tau), copying(loss)
         self._plan: Plan | None = None
 
     def __call__(self, rollout: TensorDictBase) -> dict[str, float]:
@@ -154,8 +151,11 @@ class OffPolicyUpdate:
             f"{self.updates_per_step:g} a frame after {self.learning_starts:,} frames, batches of {self.batch_size}, "
             f"{delay}{tau}{norm}compile {self.compile}"
         )
-        batch = self._plan and self._plan.batch
-        return diagram(self, Chain(self.loss, None, type(self.buffer).__name__), step, batch)
+        return diagram(self, self._view, self.optimizer, step, self._plan and self._plan.batch)
+
+    @property
+    def _view(self) -> LossView:
+        return LossView(self.loss, None, type(self.buffer).__name__)
 
     @property
     def compile_seconds(self) -> float:
@@ -178,8 +178,7 @@ class OffPolicyUpdate:
 
     def _assemble(self, data: TensorDictBase, index: Tensor) -> Plan:
         batch = self._batches.gather(data, index)
-        source, owners = type(self.buffer).__name__, self._batches.settings()
-        names = wiring.check(self.loss, None, self.optimizer, batch, source, owners)
+        names = assembly(self._view, self.optimizer, batch, owners_of_gamma=self._batches.settings())
         every = self._gradient_step(names, None, average=True)
         if self.actor_delay == 1:
             return Plan(every, every, batch)
@@ -191,7 +190,7 @@ class OffPolicyUpdate:
         self, names: Sequence[str], only: Mapping[str, Sequence[Tensor]] | None, average: bool
     ) -> GradientStep:
         """A step on all losses, or on those of ``only`` and the parameters that each of these trains."""
-        params = optimizers.parameters(self.optimizer)
+        params = optim.parameters(self.optimizer)
         if only is not None:
             kept = {id(p) for reached in only.values() for p in reached}
             params = [p for p in params if id(p) in kept]
@@ -224,7 +223,7 @@ class OffPolicyUpdate:
 
     def _critics(self, batch: TensorDictBase) -> dict[str, list[Tensor]]:
         """The critics' loss entries, and the parameters they train: by name, and whatever trains no others."""
-        params = optimizers.parameters(self.optimizer)
+        params = optim.parameters(self.optimizer)
 
         def trial() -> dict[str, list[Tensor]]:
             out, reached = self.loss(batch.copy()), {}
@@ -237,7 +236,7 @@ class OffPolicyUpdate:
 
         reached = undone(self.loss.buffers(), trial)
         if not reached:
-            raise UserError(f"actor_delay needs a critics' loss (loss_qvalue), {type(self.loss).__name__} has none")
+            raise UserError(f"actor_delay needs a critics' loss (loss_qvalue), {self._view.name} has none")
         return reached
 
 
@@ -251,29 +250,3 @@ def _averaged(results: Mapping[GradientStep, Sequence[Tensor]]) -> dict[str, flo
         name: sum(count / sum(count for count, _ in found) * mean for count, mean in found)
         for name, found in metrics.items()
     }
-
-
-def _check_sizes(buffer: Any, batch_size: int, learning_starts: int, total_frames: int | None) -> None:
-    if not hasattr(buffer, "sample"):
-        raise UserError(
-            f"the update draws from a replay buffer, this is a {type(buffer).__name__}: use data.ReplayBuffer"
-        )
-    if learning_starts < batch_size:
-        raise UserError(
-            f"batch_size={batch_size} is above the learning_starts={learning_starts} frames stored at the first "
-            "update: raise learning_starts or lower batch_size"
-        )
-    own = isinstance(buffer, ReplayBuffer)
-    unfinished = (buffer.n_steps - 1) * buffer.columns if own else 0  # frames whose n-step return is not there yet
-    capacity = buffer.capacity - unfinished if own else buffer.storage.max_size
-    if capacity < learning_starts:
-        raise UserError(
-            f"the replay has at most {capacity:,} frames to draw from and updates begin at learning_starts="
-            f"{learning_starts:,}: raise its capacity (--buffer-size) or lower learning_starts (--random-frames, "
-            "--batch-size)"
-        )
-    if total_frames is not None and total_frames < learning_starts:
-        raise UserError(
-            f"total_frames={total_frames:,} end before updates begin at learning_starts={learning_starts:,}: raise "
-            "the first or lower the second (--random-frames, --batch-size)"
-        )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from logging import getLogger
 from typing import Any, cast
 
 import torch
@@ -13,18 +12,14 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
+from pgkit.checks import LossView, assembly, check_settings, diagram
 from pgkit.compiled import Compiled, Mode, check_compile, choose, compiled
-from pgkit.errors import UserError, whole, within
+from pgkit.errors import UserError
 from pgkit.functional import standardize
+from pgkit.optim import parameters
 from pgkit.seams import Augmentation
-from pgkit.updates import wiring
-from pgkit.updates.chain import Chain
-from pgkit.updates.diagram import diagram
-from pgkit.updates.entries import another_policy
-from pgkit.updates.estimating import estimated
 from pgkit.updates.minibatches import means, minibatches
-from pgkit.updates.optimizers import check_optimizer, parameters
-from pgkit.updates.sequences import as_rows, check_one_memory, check_time
+from pgkit.updates.sequences import as_rows
 from pgkit.updates.state import load, save
 from pgkit.updates.step import GradientStep, Grads, grads_of, metrics_of
 
@@ -101,20 +96,7 @@ class OnPolicyUpdate:
         compile: str = "auto",
         seed: int | None = None,
     ) -> None:
-        check_optimizer(optimizer)
         check_compile(compile)
-        whole(1, epochs=epochs, minibatch_size=minibatch_size, sequence_length=sequence_length, accumulate=accumulate)
-        within(0, float("inf"), target_kl=target_kl)
-        _check_schedules(loss, schedules or {}, total_frames)
-        if normalize_advantage and getattr(loss, "normalize_advantage", False):
-            raise UserError(
-                f"{type(loss).__name__} normalizes the advantage already: leave normalize_advantage out here"
-            )
-        if sequence_length and minibatch_size and minibatch_size % sequence_length:
-            raise UserError(
-                f"minibatch_size={minibatch_size} is not a multiple of sequence_length={sequence_length}: a minibatch "
-                "is made of whole sequences"
-            )
         self.loss, self.advantage, self.optimizer = loss, advantage, optimizer
         self.sequence_length, self.accumulate, self.augment = sequence_length, accumulate, augment
         self.epochs, self.minibatch_size, self.max_grad_norm = epochs, minibatch_size, max_grad_norm
@@ -124,6 +106,7 @@ class OnPolicyUpdate:
         self.between: Callable[[Grads], Grads] | None = None  # changes the gradients before the optimizer's step
         self._generator = torch.Generator().manual_seed(int(torch.randint(2**62, ())) if seed is None else seed)
         self._plan: Plan | None = None
+        check_settings(self._view, vars(self))
 
     def __call__(self, rollout: TensorDictBase) -> dict[str, float]:
         """Trains on a rollout ``[num_envs, T]``; metrics are means over the minibatches.
@@ -155,7 +138,11 @@ class OnPolicyUpdate:
         size = self.minibatch_size or "the whole rollout"
         norm = f"gradient norm at most {self.max_grad_norm:g}, " if self.max_grad_norm is not None else ""
         step = f"{self.epochs} epochs of minibatches of {size}, {norm}compile {self.compile}"
-        return diagram(self, Chain(self.loss, self.advantage), step, self._plan and self._plan.batch)
+        return diagram(self, self._view, self.optimizer, step, self._plan and self._plan.batch)
+
+    @property
+    def _view(self) -> LossView:
+        return LossView(self.loss, self.advantage)
 
     @property
     def compile_seconds(self) -> float:
@@ -182,31 +169,24 @@ class OnPolicyUpdate:
 
     def _rows(self, plan: Plan, rollout: TensorDictBase) -> TensorDictBase:
         """The advantage, then the entries that the loss reads as ``[rows, ...]``."""
-        rollout = estimated(self.loss, plan.block or self.advantage, rollout)
+        rollout = self._view.estimated(rollout, plan.block or self.advantage)
         return as_rows(rollout.select(*plan.keys), self.sequence_length)
 
     def _assemble(self, rollout: TensorDictBase) -> tuple[Plan, TensorDictBase]:
         """The plan, and the rollout's rows."""
-        if self.advantage is not None:
-            check_time(rollout)
-        block = self._compiled_advantage(rollout)
-        rollout = estimated(self.loss, block or self.advantage, rollout)
-        keys = wiring.read_keys(self.loss, rollout)
-        flat = as_rows(rollout.select(*keys), self.sequence_length)
+        view, block = self._view, self._compiled_advantage(rollout)
+        estimated = view.estimated(rollout, block or self.advantage)
+        keys = view.readable(estimated)
+        flat = as_rows(estimated.select(*keys), self.sequence_length)
         batch = flat[: self._size(flat)]
-        check_one_memory(self.loss, self.advantage)
-        names = wiring.check(self.loss, self.advantage, self.optimizer, batch)
-        reason = another_policy(Chain(self.loss, self.advantage), batch)
-        if reason and not self.frames:  # a resumed collector may have collected with older weights
-            getLogger("pgkit").warning(reason)
-        chain = Chain(self.loss, None)
-        anchors = [key for key in (*chain.keys("value"), *chain.keys("sample_log_prob")) if key in keys]
+        names = assembly(view, self.optimizer, batch, rollout=rollout, resumed=self.frames > 0)
+        anchors = [key for key in (*view.keys("value"), *view.keys("sample_log_prob")) if key in keys]
         step = self._gradient_step(names, flat.numel(), self.epochs * -(-len(flat) // len(batch)))
         return Plan(block, keys, anchors, step, batch), flat
 
     def _gradient_step(self, names: Sequence[str], frames: int, steps: int) -> GradientStep:
         """One step on a minibatch, of so many steps for so many frames."""
-        params, key = parameters(self.optimizer), Chain(self.loss, None).key("advantage") or "advantage"
+        params, key = parameters(self.optimizer), self._view.key("advantage") or "advantage"
 
         def gradients(data: TensorDictBase, index: Tensor) -> tuple[Tensor, Grads]:
             batch = cast(TensorDictBase, data[index])
@@ -233,7 +213,7 @@ class OnPolicyUpdate:
     def _compiled_advantage(self, rollout: TensorDictBase) -> CompiledAdvantage | None:
         """The advantage block, compiled where it is a good part of the update: a few steps a rollout."""
         few = self.epochs * rollout.numel() <= 4 * (self.minibatch_size or rollout.numel())
-        if not (few and getattr(self.advantage, "recordable", False)):
+        if not (few and self._view.recordable):
             return None
         rollouts = None if self.total_frames is None else self.total_frames / rollout.numel()
         mode = choose(self.compile, rollouts, least_calls=5_000)
@@ -246,12 +226,12 @@ class OnPolicyUpdate:
                 for group in self.optimizer.param_groups:
                     group["lr"] = value
             else:
-                getattr(self.loss, name).fill_(value)
+                self._view.coefficients()[name].fill_(value)
 
     def _kl(self, names: Sequence[str], results: Sequence[Tensor]) -> float:
         found = [name for name in ("approx_kl", "kl_approx") if name in names]
         if not found:
-            raise UserError(f"target_kl needs a loss that reports approx_kl; {type(self.loss).__name__} does not")
+            raise UserError(f"target_kl needs a loss that reports approx_kl; {self._view.name} does not")
         return means(names, results)[found[0]]
 
 
@@ -277,19 +257,3 @@ class CompiledAdvantage:
         for key, x in zip(self.block.out_keys, self.native.bind(rollout)(), strict=True):
             rollout.set(key, x)
         return rollout
-
-
-def _check_schedules(
-    loss: nn.Module, schedules: Mapping[str, Callable[[float], float]], total_frames: int | None
-) -> None:
-    if schedules and total_frames is None:
-        raise UserError("schedules are functions of the progress: give total_frames too")
-    for name, schedule in schedules.items():
-        if not callable(schedule):
-            raise UserError(
-                f"schedules: '{name}' is {schedule!r}, give a function of the progress in [0, 1] (controllers.linear)"
-            )
-        if name != "lr" and not isinstance(getattr(loss, name, None), Tensor):
-            names = sorted(getattr(loss, "_schedulable_buffers", ()))
-            known = ["lr", *[key for key in names if isinstance(getattr(loss, key, None), Tensor)]]
-            raise UserError(f"schedules: {type(loss).__name__} has no coefficient '{name}', only {', '.join(known)}")

@@ -11,10 +11,10 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torch.optim import Optimizer
 
-from pgkit.compiled import Mode, compiled, computed_once
+from pgkit import optim
+from pgkit.checks import is_loss
+from pgkit.compiled import Mode, compiled
 from pgkit.errors import UserError
-from pgkit.updates import optimizers
-from pgkit.updates.chain import is_loss
 
 Gradients = Callable[[TensorDictBase, Tensor], tuple[Tensor, list[Tensor]]]
 Grads = list[Tensor]
@@ -35,7 +35,7 @@ def metrics_of(out: TensorDictBase, names: Iterable[str], like: Tensor) -> Tenso
 class GradientStep:
     """``step(data, index) -> metrics``: gradients, norm clip, optimizer, target networks.
 
-    With an optimizer that has a rule (:mod:`pgkit.updates.optimizers`) all of it is one compiled graph. Gradients that
+    With an optimizer that has a rule (:func:`pgkit.optim.bound`) all of it is one compiled graph. Gradients that
     are added up over minibatches, or that ``between`` changes, make two, and an optimizer without a rule steps by
     itself.
 
@@ -75,18 +75,18 @@ class GradientStep:
         if max_grad_norm is not None and max_grad_norm <= 0:
             raise UserError(f"max_grad_norm={max_grad_norm} lets nothing be trained: give a bound above 0, or None")
         self.optimizer, self.names, self.between = optimizer, [*names, "grad_norm"], between
-        self._params = optimizers.parameters(optimizer) if params is None else list(params)
-        functional = optimizers.functional(optimizer, fused=mode == "off", params=self._params)
-        rule, self._read_learning_rates, rates = functional or (self._torch_step, lambda: None, [])
-        self._apart = apart or between is not None or functional is None
+        self._params = optim.parameters(optimizer) if params is None else list(params)
+        self._rules = rules = None if mode == "off" else optim.bound(optimizer, self._params)
+        step = partial(optim.step, optimizer, self._params) if rules is None else rules.apply
+        self._apart = apart or between is not None or rules is None
 
         @torch.no_grad()
         def apply(grads: Grads) -> Tensor:
             norm = torch.stack([grad.square().sum() for grad in grads]).sum().sqrt()
             if max_grad_norm is not None:
-                factor = computed_once((max_grad_norm / (norm + 1e-6)).clamp(max=1.0))
+                factor = optim.computed_once((max_grad_norm / (norm + 1e-6)).clamp(max=1.0))
                 grads = [grad * factor for grad in grads]
-            rule(grads)
+            step(grads)
             if average is not None:
                 average()
             return norm
@@ -98,12 +98,11 @@ class GradientStep:
         def second(_: None, *grads: Tensor) -> list[Tensor]:
             return [apply(list(grads))]
 
-        states = [x for p in self._params for x in optimizer.state.get(p, {}).values() if torch.is_tensor(x)]
-        held = [*self._params, *states, *rates, *holds]
+        held = [*self._params, *([] if rules is None else rules.tensors), *holds]
         native = partial(compiled, watch=watch, holds=held)
         self.native = (
             native(first, others=other_rows, mode=mode, name="the update"),
-            native(second, others=_other_gradients, mode=mode if functional else "off", name="the optimizer's step"),
+            native(second, others=_other_gradients, mode="off" if rules is None else mode, name="the optimizer's step"),
         )
 
     def __call__(self, data: TensorDictBase, index: Tensor) -> Tensor:
@@ -124,9 +123,8 @@ class GradientStep:
                 "a parameter of the optimizer was frozen after the first step (requires_grad is False): what is "
                 "trained is decided when an update is built, build a new one with an optimizer of the others"
             )
-        self._read_learning_rates()
-        for part in getattr(self.optimizer, "parts", [self.optimizer]):
-            part._opt_called = True  # what torch's schedulers look at before they warn that none stepped
+        if self._rules is not None:
+            self._rules.read()
         first, size = self.native[0], len(index)
         call = first.bind(data, index)
 
@@ -144,12 +142,6 @@ class GradientStep:
             return torch.cat([metrics, norm[None]])
 
         return call
-
-    def _torch_step(self, grads: Grads) -> None:
-        self.optimizer.zero_grad(set_to_none=True)
-        for param, grad in zip(self._params, grads, strict=True):
-            param.grad = grad
-        self.optimizer.step()
 
 
 def _sum(results: Iterable[Sequence[Tensor]], shares: Sequence[float]) -> list[Tensor]:

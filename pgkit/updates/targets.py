@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 import torch
 from torch import Tensor, nn
 
+from pgkit.checks import LossView
 from pgkit.errors import UserError, within
 
 Pairs = dict[tuple[str, ...], tuple[Tensor, Tensor]]
@@ -14,21 +15,11 @@ Tau = float | Mapping[str, float]
 
 
 def target_pairs(loss: nn.Module) -> Pairs:
-    """``path -> (target, source)`` of every tensor of ``target_*_params`` that has a storage of its own.
-
-    The loss is told that its targets are taken care of, as TorchRL's ``SoftUpdate`` does.
-    """
-    associated = getattr(loss, "_has_update_associated", {})
-    for name in associated:
-        associated[name] = True
+    """``path -> (target, source)`` of every tensor of a target network that has a storage of its own."""
     pairs: Pairs = {}
-    for name, target in loss.named_children():
-        if name.startswith("target_") and name.endswith("_params"):
-            network = name.removeprefix("target_")
-            source = loss.get_submodule(network)
-            for key in target.keys(True, True):
-                path = (network.removesuffix("_params"), *((key,) if isinstance(key, str) else key))
-                pairs[path] = (target.get(key), source.get(key))
+    for name, target, source in LossView(loss).delayed():
+        for key in target.keys(True, True):
+            pairs[(name, *((key,) if isinstance(key, str) else key))] = (target.get(key), source.get(key))
     apart = {path: (t, s) for path, (t, s) in pairs.items() if t.data_ptr() != s.data_ptr()}
     # a compiled graph loses writes to a float64 scalar (a normalizer's count): a scalar buffer is a vector of one here
     scalar = {path for path, (target, source) in apart.items() if target.dim() == 0 and not source.requires_grad}

@@ -11,16 +11,12 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torch.optim import SGD, Optimizer
 
+from pgkit.checks import LossView, assembly, check_settings, diagram
 from pgkit.compiled import check_compile, choose
-from pgkit.errors import UserError, whole, within
 from pgkit.functional import conjugate_gradient
-from pgkit.updates import wiring
-from pgkit.updates.chain import Chain
-from pgkit.updates.diagram import diagram
-from pgkit.updates.estimating import estimated
+from pgkit.optim import parameters
 from pgkit.updates.minibatches import means, minibatches
-from pgkit.updates.optimizers import check_optimizer, parameters
-from pgkit.updates.sequences import as_rows, check_time
+from pgkit.updates.sequences import as_rows
 from pgkit.updates.state import load, save
 from pgkit.updates.step import GradientStep, Grads, grads_of, metrics_of
 
@@ -95,35 +91,24 @@ class TrustRegionUpdate:
         compile: str = "auto",
         seed: int | None = None,
     ) -> None:
-        if optimizer is not None:
-            check_optimizer(optimizer)
         check_compile(compile)
-        whole(1, epochs=epochs, minibatch_size=minibatch_size, cg_steps=cg_steps)
-        within(0, float("inf"), max_kl=max_kl, damping=damping)
         self.loss, self.advantage, self.optimizer = loss, advantage, optimizer
         self.max_kl, self.cg_steps, self.damping = max_kl, cg_steps, damping
         self.sizes = [backtrack_factor**j for j in range(backtracks + 1)] if line_search else [1.0]
         self.line_search = line_search
         self.epochs, self.minibatch_size, self.max_grad_norm = epochs, minibatch_size, max_grad_norm
         self.total_frames, self.compile, self.frames = total_frames, compile, 0
+        check_settings(self._view, vars(self))
         self._params = [p for p in loss.actor_network_params.values(True, True) if p.requires_grad]
         self._generator = torch.Generator().manual_seed(int(torch.randint(2**62, ())) if seed is None else seed)
         self.between: Callable[[Grads], Grads] | None = None  # changes the critic's gradients before its step
         self._plan: Plan | None = None
-        trained = {id(p) for p in self._params}
-        if optimizer is not None and any(id(p) in trained for p in parameters(optimizer)):
-            raise UserError(
-                "TrustRegionUpdate steps the actor itself: build the optimizer from critic.parameters() alone, and "
-                "share no layers between the two"
-            )
 
     def __call__(self, rollout: TensorDictBase) -> dict[str, float]:
         """Trains on a rollout ``[num_envs, T]``: time is the last dimension."""
-        if self._plan is None and self.advantage is not None:
-            check_time(rollout)
-        rollout = estimated(self.loss, self.advantage, rollout)
-        flat = as_rows(rollout.select(*wiring.read_keys(self.loss, rollout)), None)
-        plan = self._plan = self._plan or self._assemble(flat)
+        estimated = self._view.estimated(rollout, self.advantage)
+        flat = as_rows(estimated.select(*self._view.readable(estimated)), None)
+        plan = self._plan = self._plan or self._assemble(rollout, flat)
         metrics = self._step_policy(self.loss.keep_distribution(flat.copy()), plan.names)
         if plan.critic is not None:
             metrics |= self._step_critic(plan.critic, flat)
@@ -133,7 +118,11 @@ class TrustRegionUpdate:
     def __str__(self) -> str:
         step = f"KL at most {self.max_kl:g}, {'line search' if self.line_search else 'full step'}; then the critic, "
         step += f"{self.epochs} epochs of minibatches of {self.minibatch_size or 'the whole rollout'}"
-        return diagram(self, Chain(self.loss, self.advantage), step, self._plan and self._plan.batch)
+        return diagram(self, self._view, self.optimizer, step, self._plan and self._plan.batch)
+
+    @property
+    def _view(self) -> LossView:
+        return LossView(self.loss, self.advantage)
 
     def _step_policy(self, batch: TensorDictBase, names: Sequence[str]) -> dict[str, float]:
         out = self.loss(batch)
@@ -182,11 +171,11 @@ class TrustRegionUpdate:
                 results.append(call(*indices))
         return means(step.names, results)
 
-    def _assemble(self, flat: TensorDictBase) -> Plan:
+    def _assemble(self, rollout: TensorDictBase, flat: TensorDictBase) -> Plan:
         rows, critic = len(flat), [] if self.optimizer is None else parameters(self.optimizer)
         size = min(self.minibatch_size or rows, rows)
         every = SGD([*self._params, *critic], lr=0.0)  # who is trained, by the step or by the optimizer
-        names = wiring.check(self.loss, self.advantage, every, flat[:size])
+        names = assembly(self._view, every, flat[:size], rollout=rollout, resumed=self.frames > 0)
         own = [name for name in names if name not in (CRITIC, "explained_variance")]
         if self.optimizer is None:
             return Plan(own, None, flat[:size])

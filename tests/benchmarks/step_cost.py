@@ -23,9 +23,9 @@ from torchrl.collectors import Collector
 from torchrl.objectives.value import GAE
 
 from pgkit import advantages, collectors, envs, losses, modules
+from pgkit.checks import LossView
 from pgkit.updates import GradientStep
 from pgkit.updates.step import grads_of, metrics_of
-from pgkit.updates.wiring import read_keys
 
 ENV_ID, NUM_ENVS, STEPS, ROWS, OBSERVATION, ACTION = "HalfCheetah-v5", 8, 256, 64, 17, 6
 
@@ -91,7 +91,7 @@ def pgkit_loss(actor: Any, critic: Any) -> losses.ClipPPOLoss:
 
 def pgkit_step(loss: Any, rollout: TensorDict, index: torch.Tensor, compiled: bool) -> Callable[..., Any]:
     """pgkit's step for any loss, on the rollout as OnPolicyUpdate hands it to that step."""
-    flat = rollout.select(*read_keys(loss, rollout)).reshape(-1).contiguous()
+    flat = rollout.select(*LossView(loss).readable(rollout)).reshape(-1).contiguous()
     names = [key for key, value in loss(flat[:ROWS]).items() if value.numel() == 1]
     optimizer = torch.optim.Adam(loss.parameters(), lr=3e-4)
     params = optimizer.param_groups[0]["params"]
