@@ -15,6 +15,7 @@ COUNTS = ("epochs", "minibatch_size", "sequence_length", "batch_size", "actor_de
 BOUNDS = {  # name: least, greatest, kind
     **dict.fromkeys(COUNTS, (1, ANY, int)),
     **dict.fromkeys(("target_kl", "updates_per_step", "max_kl", "damping"), (0, ANY, float)),
+    "tau": (0, 1, float),
 }
 
 

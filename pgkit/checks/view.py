@@ -63,17 +63,17 @@ class LossView:
         params = self.networks().get(network, (None, None))[1]
         return [] if params is None else list(params.values(True, True))
 
-    def delayed(self) -> dict[str, tuple[TensorDictBase, TensorDictBase]]:
-        """``name -> (target, source)``: the parameters of each network that has a target network.
+    def delayed(self) -> list[tuple[str, TensorDictBase, TensorDictBase]]:
+        """``(name, target, source)``, the parameters of each network that has a target network.
 
         The loss is told that its targets are taken care of, as TorchRL's ``SoftUpdate`` does.
         """
         if isinstance(self.loss, LossModule):
             self.loss._has_update_associated.update(dict.fromkeys(self.loss._has_update_associated, True))
         children = dict[str, Any](self.loss.named_children())
-        networks = [name.removesuffix("_params") for name in children if name.endswith("_params")]
-        pairs = {name: (children.get(f"target_{name}_params"), children[f"{name}_params"]) for name in networks}
-        return {name: (target, source) for name, (target, source) in pairs.items() if target is not None}
+        names = [name.removesuffix("_params") for name in children if name.endswith("_params")]
+        targets = [name for name in names if f"target_{name}" in names]
+        return [(name, children[f"target_{name}_params"], children[f"{name}_params"]) for name in targets]
 
     def distribution(self, batch: TensorDictBase) -> Any:
         """The actor's distribution at the batch's observations; None for an actor without one."""

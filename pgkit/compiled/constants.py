@@ -5,13 +5,13 @@ from __future__ import annotations
 import operator
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
-from types import FunctionType, MethodType
+from types import BuiltinFunctionType, FunctionType, MethodType
 from typing import Any
 
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
-_KEPT = (int, float, str, FunctionType, MethodType, partial, Tensor, nn.Module)
+_KEPT = (int, float, str, FunctionType, BuiltinFunctionType, MethodType, partial, Tensor, nn.Module)
 _LIBRARIES = {"torch", "tensordict", "torchrl", "pgkit"}  # their _names are their own affair
 _INTERNAL = {name for name in vars(nn.Module()) if name.startswith("_")}
 _MOST_ITEMS = 100  # of a list: it may be a log

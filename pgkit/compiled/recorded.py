@@ -101,8 +101,13 @@ def recorded(
         return out
 
     check_repeats(first, recorder.function, recorder.held, others)
-    if not decisions and all(x.is_cuda for x in (*recorder.held, *recorder.leaves(data), *inputs)):
+    tensors = [*recorder.held, *recorder.leaves(data), *inputs]
+    elsewhere = [tuple(x.shape) for x in tensors if not x.is_cuda]
+    if tensors and not elsewhere and not decisions:
         return captured(graph, recorder.leaves, recorder.held, inputs)
+    if len(elsewhere) < len(tensors):
+        why = "it decides on values" if decisions else f"a tensor of shape {elsewhere[0]} is not on the device"
+        getLogger("pgkit").info("not one CUDA graph: %s", why)
     graphs = [graph]
 
     def bind(data: TensorDictBase | None) -> Function:

@@ -22,6 +22,9 @@ class OwnBatches:
     :meth:`extend` stores a rollout; :meth:`draw` gives a pair ``(data, index)`` a step, :meth:`gather` the batch of a
     pair and :meth:`write_back` takes its priorities, both in the graph; :meth:`written` is what that changes besides
     the data; :meth:`drawn` follows each step, outside the graph; :meth:`settings` has the owners of a ``gamma``.
+
+    Attributes:
+        capacity: frames that there can be to draw from.
     """
 
     def __init__(self, buffer: ReplayBuffer, loss: nn.Module, batch_size: int) -> None:

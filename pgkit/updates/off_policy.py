@@ -11,11 +11,11 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
+from pgkit import optim
 from pgkit.checks import LossView, assembly, check_settings, diagram, is_loss
 from pgkit.compiled import check_compile, choose, undone
 from pgkit.data import ReplayBuffer
 from pgkit.errors import UserError
-from pgkit.optim import parameters
 from pgkit.seams import Augmentation
 from pgkit.updates.batches import Batches, OwnBatches, TorchRLBatches
 from pgkit.updates.minibatches import means
@@ -97,7 +97,8 @@ class OffPolicyUpdate:
         self._due = 0.0
         source = OwnBatches if isinstance(buffer, ReplayBuffer) else TorchRLBatches
         self._batches: Batches = source(buffer, loss, batch_size * accumulate)
-        check_settings(self._view, vars(self) | {"capacity": self._batches.capacity})
+        one_tau = None if isinstance(tau, Mapping) else tau
+        check_settings(LossView(loss), vars(self) | {"capacity": self._batches.capacity, "tau": one_tau})
         self._average, self._copy_statistics = averaging(loss, tau), copying(loss)
         self._plan: Plan | None = None
 
@@ -140,10 +141,6 @@ class OffPolicyUpdate:
             self.updates += 1
         return _averaged(results)
 
-    @property
-    def _view(self) -> LossView:
-        return LossView(self.loss, None, type(self.buffer).__name__)
-
     def __str__(self) -> str:
         norm = f"gradient norm at most {self.max_grad_norm:g}, " if self.max_grad_norm is not None else ""
         delay = f"the actor once in {self.actor_delay} steps, " if self.actor_delay > 1 else ""
@@ -154,8 +151,11 @@ class OffPolicyUpdate:
             f"{self.updates_per_step:g} a frame after {self.learning_starts:,} frames, batches of {self.batch_size}, "
             f"{delay}{tau}{norm}compile {self.compile}"
         )
-        batch = self._plan and self._plan.batch
-        return diagram(self, self._view, self.optimizer, step, batch)
+        return diagram(self, self._view, self.optimizer, step, self._plan and self._plan.batch)
+
+    @property
+    def _view(self) -> LossView:
+        return LossView(self.loss, None, type(self.buffer).__name__)
 
     @property
     def compile_seconds(self) -> float:
@@ -190,7 +190,7 @@ class OffPolicyUpdate:
         self, names: Sequence[str], only: Mapping[str, Sequence[Tensor]] | None, average: bool
     ) -> GradientStep:
         """A step on all losses, or on those of ``only`` and the parameters that each of these trains."""
-        params = parameters(self.optimizer)
+        params = optim.parameters(self.optimizer)
         if only is not None:
             kept = {id(p) for reached in only.values() for p in reached}
             params = [p for p in params if id(p) in kept]
@@ -223,7 +223,7 @@ class OffPolicyUpdate:
 
     def _critics(self, batch: TensorDictBase) -> dict[str, list[Tensor]]:
         """The critics' loss entries, and the parameters they train: by name, and whatever trains no others."""
-        params = parameters(self.optimizer)
+        params = optim.parameters(self.optimizer)
 
         def trial() -> dict[str, list[Tensor]]:
             out, reached = self.loss(batch.copy()), {}

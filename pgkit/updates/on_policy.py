@@ -103,10 +103,10 @@ class OnPolicyUpdate:
         self.recompute_advantage, self.normalize_advantage = recompute_advantage, normalize_advantage
         self.target_kl, self.schedules, self.total_frames = target_kl, dict(schedules or {}), total_frames
         self.compile, self.frames = compile, 0
-        check_settings(self._view, vars(self))
         self.between: Callable[[Grads], Grads] | None = None  # changes the gradients before the optimizer's step
         self._generator = torch.Generator().manual_seed(int(torch.randint(2**62, ())) if seed is None else seed)
         self._plan: Plan | None = None
+        check_settings(self._view, vars(self))
 
     def __call__(self, rollout: TensorDictBase) -> dict[str, float]:
         """Trains on a rollout ``[num_envs, T]``; metrics are means over the minibatches.
@@ -134,15 +134,15 @@ class OnPolicyUpdate:
         rate = float(self.optimizer.param_groups[0]["lr"])
         return means(plan.step.names, results) | {"epochs": float(epoch), "learning_rate": rate}
 
-    @property
-    def _view(self) -> LossView:
-        return LossView(self.loss, self.advantage)
-
     def __str__(self) -> str:
         size = self.minibatch_size or "the whole rollout"
         norm = f"gradient norm at most {self.max_grad_norm:g}, " if self.max_grad_norm is not None else ""
         step = f"{self.epochs} epochs of minibatches of {size}, {norm}compile {self.compile}"
         return diagram(self, self._view, self.optimizer, step, self._plan and self._plan.batch)
+
+    @property
+    def _view(self) -> LossView:
+        return LossView(self.loss, self.advantage)
 
     @property
     def compile_seconds(self) -> float:

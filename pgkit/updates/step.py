@@ -15,7 +15,6 @@ from pgkit import optim
 from pgkit.checks import is_loss
 from pgkit.compiled import Mode, compiled
 from pgkit.errors import UserError
-from pgkit.optim import computed_once
 
 Gradients = Callable[[TensorDictBase, Tensor], tuple[Tensor, list[Tensor]]]
 Grads = list[Tensor]
@@ -36,7 +35,7 @@ def metrics_of(out: TensorDictBase, names: Iterable[str], like: Tensor) -> Tenso
 class GradientStep:
     """``step(data, index) -> metrics``: gradients, norm clip, optimizer, target networks.
 
-    With an optimizer that has a rule (:mod:`pgkit.optim`) all of it is one compiled graph. Gradients that
+    With an optimizer that has a rule (:func:`pgkit.optim.bound`) all of it is one compiled graph. Gradients that
     are added up over minibatches, or that ``between`` changes, make two, and an optimizer without a rule steps by
     itself.
 
@@ -77,19 +76,17 @@ class GradientStep:
             raise UserError(f"max_grad_norm={max_grad_norm} lets nothing be trained: give a bound above 0, or None")
         self.optimizer, self.names, self.between = optimizer, [*names, "grad_norm"], between
         self._params = optim.parameters(optimizer) if params is None else list(params)
-        self._rules = None if mode == "off" else optim.bound(optimizer, self._params)
-        self._apart = apart or between is not None or self._rules is None
+        self._rules = rules = None if mode == "off" else optim.bound(optimizer, self._params)
+        step = partial(optim.step, optimizer, self._params) if rules is None else rules.apply
+        self._apart = apart or between is not None or rules is None
 
         @torch.no_grad()
         def apply(grads: Grads) -> Tensor:
             norm = torch.stack([grad.square().sum() for grad in grads]).sum().sqrt()
             if max_grad_norm is not None:
-                factor = computed_once((max_grad_norm / (norm + 1e-6)).clamp(max=1.0))
+                factor = optim.computed_once((max_grad_norm / (norm + 1e-6)).clamp(max=1.0))
                 grads = [grad * factor for grad in grads]
-            if self._rules is None:
-                optim.step(optimizer, self._params, grads)
-            else:
-                self._rules.apply(grads)
+            step(grads)
             if average is not None:
                 average()
             return norm
@@ -101,11 +98,11 @@ class GradientStep:
         def second(_: None, *grads: Tensor) -> list[Tensor]:
             return [apply(list(grads))]
 
-        held = [*self._params, *(self._rules.tensors if self._rules else ()), *holds]
+        held = [*self._params, *([] if rules is None else rules.tensors), *holds]
         native = partial(compiled, watch=watch, holds=held)
         self.native = (
             native(first, others=other_rows, mode=mode, name="the update"),
-            native(second, others=_other_gradients, mode=mode if self._rules else "off", name="the optimizer's step"),
+            native(second, others=_other_gradients, mode="off" if rules is None else mode, name="the optimizer's step"),
         )
 
     def __call__(self, data: TensorDictBase, index: Tensor) -> Tensor:

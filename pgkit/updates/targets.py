@@ -15,12 +15,11 @@ Tau = float | Mapping[str, float]
 
 
 def target_pairs(loss: nn.Module) -> Pairs:
-    """``path -> (target, source)`` of every tensor of ``target_*_params`` that has a storage of its own."""
+    """``path -> (target, source)`` of every tensor of a target network that has a storage of its own."""
     pairs: Pairs = {}
-    for network, (target, source) in LossView(loss).delayed().items():
+    for name, target, source in LossView(loss).delayed():
         for key in target.keys(True, True):
-            path = (network, *((key,) if isinstance(key, str) else key))
-            pairs[path] = (target.get(key), source.get(key))
+            pairs[(name, *((key,) if isinstance(key, str) else key))] = (target.get(key), source.get(key))
     apart = {path: (t, s) for path, (t, s) in pairs.items() if t.data_ptr() != s.data_ptr()}
     # a compiled graph loses writes to a float64 scalar (a normalizer's count): a scalar buffer is a vector of one here
     scalar = {path for path, (target, source) in apart.items() if target.dim() == 0 and not source.requires_grad}

@@ -115,14 +115,14 @@ class TrustRegionUpdate:
         self.frames += len(flat)
         return metrics
 
-    @property
-    def _view(self) -> LossView:
-        return LossView(self.loss, self.advantage)
-
     def __str__(self) -> str:
         step = f"KL at most {self.max_kl:g}, {'line search' if self.line_search else 'full step'}; then the critic, "
         step += f"{self.epochs} epochs of minibatches of {self.minibatch_size or 'the whole rollout'}"
         return diagram(self, self._view, self.optimizer, step, self._plan and self._plan.batch)
+
+    @property
+    def _view(self) -> LossView:
+        return LossView(self.loss, self.advantage)
 
     def _step_policy(self, batch: TensorDictBase, names: Sequence[str]) -> dict[str, float]:
         out = self.loss(batch)
