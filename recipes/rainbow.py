@@ -104,9 +104,7 @@ def agent(args: Args, env: EnvBase) -> run.Agent:
         raise UserError(f"--v-min {args.v_min:g} --v-max {args.v_max:g}: give a least return below the largest")
     shape = env.observation_spec_unbatched["observation"].shape
     if len(shape) != 1:
-        raise UserError(
-            f"rainbow reads vectors, an observation of '{args.env_id}' is {list(shape)}: flatten it"
-        )
+        raise UserError(f"rainbow reads vectors, an observation of '{args.env_id}' is {list(shape)}: flatten it")
     sizes = (shape[0], actions)
     net = DuelingNoisyNet(*sizes, args.atoms, args.hidden, args.noise)
     actor = DistributionalQValueActor(
