@@ -11,6 +11,7 @@ from logging import getLogger
 from pathlib import Path
 from typing import Any, Protocol
 
+import torch
 from torchrl.data import LazyMemmapStorage
 from torchrl.data.replay_buffers import TensorStorage
 

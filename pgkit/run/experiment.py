@@ -16,9 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from pgkit.errors import UserError
-from pgkit.run.directory import read_config
+from pgkit.run.config import read_config, read_json
 from pgkit.run.metrics import column, read_csv
-from pgkit.run.settings import read_json
 
 COLUMNS = ("recipe", "env", "settings", "seed", "frames", "eval_mean", "minutes", "fps", "versions")
 CURVE = ("recipe", "env", "settings", "seed", "frames", "eval_mean", "minutes")
@@ -56,7 +55,7 @@ class Cell:
     def command(self) -> list[str]:
         """How this cell is run by hand; it goes on where it was stopped."""
         where = ["--env-id", self.env, "--seed", str(self.seed), "--run-dir", str(self.directory)]
-        return ["pgkit", "run", self.recipe, *where, *self.flags]
+        return ["pgkit", "run", self.recipe, *where, "--resume-if-possible", *self.flags]
 
     def start(self) -> None:
         self.folder.mkdir(parents=True, exist_ok=True)

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from pgkit.errors import UserError
+from pgkit.run.config import read_json
 from pgkit.run.experiment import Cell
 from pgkit.run.metrics import column, read_csv
-from pgkit.run.settings import read_json
 
 Space = Mapping[str, Any]
 """Setting to its range: ``(low, high)``, ``(low, high, "log")`` or a list of choices; whole bounds, whole numbers."""

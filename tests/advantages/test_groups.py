@@ -2,7 +2,6 @@
 
 import pytest
 import torch
-from pgkit.updates.recorded import recorded_block
 from tensordict import TensorDict
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from torchrl.modules import MultiAgentMLP, ProbabilisticActor
@@ -11,6 +10,7 @@ from torchrl.objectives.value import MultiAgentGAE
 from pgkit import advantages, modules
 from pgkit.errors import UserError
 from pgkit.functional import standardize
+from pgkit.updates.on_policy import CompiledAdvantage
 
 N, T, A = 3, 11, 2
 
@@ -196,7 +196,8 @@ def test_recorded_it_gives_the_same(own_flags):
     rollout, (group, _) = group_rollout(own_flags), agents()
     rollout["collector"] = {"mask": torch.rand(N, T) < 0.7}
     block = advantages.GAE(group[0], average_gae=True)
-    recorded = recorded_block(block, rollout)
+    recorded = CompiledAdvantage(block, "on")
+    recorded(rollout.copy())
     other = group_rollout(own_flags)
     other["collector"] = {"mask": torch.rand(N, T) < 0.5}
     torch.testing.assert_close(

@@ -4,11 +4,11 @@ from collections import deque
 
 import pytest
 import torch
-from pgkit.compiling import compile_record, record
 from tensordict import TensorDict
 from torchrl.data import Bounded, Composite, Unbounded
 
 from pgkit import data, envs
+from pgkit.compiled.native import compile_record, record
 from pgkit.errors import UserError
 
 
