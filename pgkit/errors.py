@@ -17,7 +17,7 @@ class Diverged(RuntimeError):
     """A run's weights or losses are not finite. The command line prints one line and exits with 3."""
 
 
-def whole(least: int, **settings: Any) -> None:
+def check_whole_number(least: int, **settings: Any) -> None:
     """Raises ``UserError`` for a setting that is no whole number, or below ``least``; None passes."""
     for name, value in settings.items():
         if value is not None and (not isinstance(value, Integral) or value < least):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
-import pickle
+import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any, NoReturn
@@ -30,7 +30,6 @@ def replacing(path: Path) -> Iterator[IO[bytes]]:
     """
     part = path.with_name(f".{path.name}.part")
     try:
-        path.parent.mkdir(exist_ok=True)
         part.unlink(missing_ok=True)  # of a process that was killed; a link is removed, never followed
         with open(part, "xb") as file:
             yield file
@@ -69,17 +68,18 @@ def load(path: Path) -> Any:
         UserError: the file is not there, its hash differs, or it holds code.
     """
     try:
-        with path.open("rb") as file:
+        with path.open("rb") as file, warnings.catch_warnings():
             if not _fits(file):
                 raise UserError(f"{path} is damaged: its hash does not fit, or an earlier pgkit wrote it")
             file.seek(0)
+            warnings.simplefilter("ignore")
             return _decode(torch.load(file, map_location="cpu", weights_only=True))
     except FileNotFoundError:
         raise UserError(f"{path} is not there") from None
-    except (OSError, RuntimeError, EOFError, ValueError, TypeError, KeyError, pickle.UnpicklingError) as error:
-        if isinstance(error, UserError):
-            raise
-        raise UserError(f"{path} is damaged: {str(error).splitlines()[0]}") from error
+    except UserError:
+        raise
+    except Exception as error:  # a reader may stumble over forged bytes in any way
+        raise UserError(f"{path} is damaged: {(str(error) or repr(error)).splitlines()[0]}") from error
 
 
 class _Hashing:

@@ -46,7 +46,7 @@ class Simulator(Protocol):
         device: where its tensors live.
         observation_spec, action_spec, reward_spec, done_spec: TorchRL's, of batch size ``[N]``.
         resume: what :meth:`state_dict` promises: every environment ``exact`` as it was, or ``new episodes``.
-        episode_reward: return so far of the episodes that the last step belonged to, before any reset; keyed as rewards.
+        episode_reward: return so far of the episodes that the last step belonged to, before any reset; keyed as reward.
         step_count: their length so far, int64 ``[N]``.
     """
 
@@ -93,6 +93,37 @@ class Loss(Protocol):
     """A ``LossModule``: every ``loss_*`` entry is summed and minimized, every other entry is a detached scalar."""
 
     def __call__(self, batch: TensorDictBase, /) -> TensorDictBase: ...
+
+
+@runtime_checkable
+class KeepsDistribution(Protocol):
+    """A loss of a policy that measures how far the policy has moved, as a trust region needs it."""
+
+    def keep_distribution(self, batch: TensorDictBase, /) -> TensorDictBase:
+        """Writes the parameters of the policy's distribution into the batch, as of now."""
+        ...
+
+    def kl(self, batch: TensorDictBase, /) -> Tensor:
+        """Divergence ``[*B]`` of the present distribution from the one kept in the batch."""
+        ...
+
+
+@runtime_checkable
+class Memory(Protocol):
+    """A module whose state goes from step to step, ``state_size`` numbers: a recurrent core, correlated noise."""
+
+    state_size: int
+
+
+@runtime_checkable
+class Replay(Protocol):
+    """What an off-policy update stores rollouts in and draws batches from."""
+
+    def __len__(self) -> int: ...
+
+    def extend(self, data: TensorDictBase, /) -> Any: ...
+
+    def sample(self, batch_size: int, /) -> TensorDictBase: ...
 
 
 class Stateful(Protocol):

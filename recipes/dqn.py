@@ -73,7 +73,10 @@ def agent(args: Args, env: EnvBase) -> run.Agent:
     actions = getattr(env.action_spec_unbatched.space, "n", None)
     if actions is None:
         raise UserError(f"dqn needs one discrete action, '{args.env_id}' has another action space: use sac or td3")
-    sizes = (env.observation_spec_unbatched["observation"].shape[-1], actions)
+    shape = env.observation_spec_unbatched["observation"].shape
+    if len(shape) != 1:
+        raise UserError(f"dqn reads vectors, an observation of '{args.env_id}' is {list(shape)}: flatten it")
+    sizes = (shape[0], actions)
     net = modules.mlp(*sizes, args.hidden, torch.nn.ReLU)
     actor = QValueActor(net, in_keys=["observation"], action_space="categorical")
     settings = {"loss_function": args.loss_function, "double_dqn": args.double}

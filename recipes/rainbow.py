@@ -102,7 +102,10 @@ def agent(args: Args, env: EnvBase) -> run.Agent:
         raise UserError(f"rainbow needs one discrete action, '{args.env_id}' has another action space: use sac")
     if args.v_min >= args.v_max:
         raise UserError(f"--v-min {args.v_min:g} --v-max {args.v_max:g}: give a least return below the largest")
-    sizes = (env.observation_spec_unbatched["observation"].shape[-1], actions)
+    shape = env.observation_spec_unbatched["observation"].shape
+    if len(shape) != 1:
+        raise UserError(f"rainbow reads vectors, an observation of '{args.env_id}' is {list(shape)}: flatten it")
+    sizes = (shape[0], actions)
     net = DuelingNoisyNet(*sizes, args.atoms, args.hidden, args.noise)
     actor = DistributionalQValueActor(
         TensorDictModule(net, in_keys=["observation"], out_keys=["action_value"]),

@@ -11,7 +11,7 @@ from torch import nn
 from pgkit import advantages, collectors, controllers, data, envs, losses, modules, updates
 from pgkit.envs.layout import layout
 from pgkit.envs.vector import action_spec
-from pgkit.errors import UserError, whole, within
+from pgkit.errors import UserError, check_whole_number, within
 
 ENV = envs.make("Pendulum-v1")
 ACTOR, CRITIC = modules.gaussian_actor(ENV, (8,)), modules.state_value(ENV, (8,))
@@ -96,25 +96,32 @@ def test_a_wrong_argument_is_named(call, message):
 
 
 def test_bounds_are_inclusive_and_none_passes():
-    whole(1, a=1, b=None, c=np.int64(2))
+    check_whole_number(1, a=1, b=None, c=np.int64(2))
     within(0, 1, a=0, b=1.0, c=torch.tensor(0.5), d=None)
     for low, high, value in ((0, 1, 1.01), (0, 1, float("nan")), (1, float("inf"), 0.5)):
         with pytest.raises(UserError, match="^a="):
             within(low, high, a=value)
 
 
-def test_a_batch_of_another_policy_is_said(caplog):
-    def trained_on(actor):
-        loss = losses.ClipPPOLoss(ACTOR, CRITIC)
-        update = updates.OnPolicyUpdate(
-            loss, advantages.GAE(CRITIC), torch.optim.SGD(loss.parameters(), lr=0.0), compile="off"
-        )
-        update(collectors.VectorCollector(ENV, actor, frames_per_batch=64, compile="off").rollout())
+def test_a_batch_of_another_policy_is_said_but_not_of_one_that_an_earlier_phase_has_trained(caplog):
+    critic = modules.state_value(ENV, (8,))
+
+    def warns(actor, rollout, lr=0.0):
+        caplog.clear()
+        loss = losses.ClipPPOLoss(actor, critic)
+        optimizer = torch.optim.SGD(loss.parameters(), lr=lr)
+        updates.OnPolicyUpdate(loss, advantages.GAE(critic), optimizer, epochs=1, compile="off")(rollout)
         return "is the loss built on the actor that collects?" in caplog.text
 
-    assert not trained_on(ACTOR)
-    other = modules.gaussian_actor(ENV, (8,), log_std=0.0)
-    assert trained_on(other)
+    actor, other = modules.gaussian_actor(ENV, (8,)), modules.gaussian_actor(ENV, (8,), log_std=0.0)
+    rollout = collectors.VectorCollector(ENV, actor, frames_per_batch=64, compile="off").rollout()
+    with torch.no_grad():
+        loc = actor(rollout.select("observation"))["loc"]
+    assert not warns(actor, rollout, lr=100.0)  # phase one
+    with torch.no_grad():
+        moved = (actor(rollout.select("observation"))["loc"] - loc).abs().max()
+    assert moved > 0.01 and not warns(actor, rollout)  # phase two, with an update of its own
+    assert warns(other, rollout)
 
 
 def test_rows_that_are_as_many_as_features_are_no_broadcast_mistake():

@@ -9,7 +9,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 
-from pgkit.advantages.base import Advantage, ends
+from pgkit.advantages.base import Advantage
 from pgkit.errors import within
 from pgkit.functional import generalized_advantage
 
@@ -23,7 +23,8 @@ class GAE(Advantage):
         critic: value operator, reads the rollout's observation, writes ``state_value``.
         gamma: discount.
         lmbda: GAE's lambda.
-        average_gae: standardize the advantage over the whole rollout (TorchRL's keyword).
+        average_gae: standardize the advantage over the whole rollout (TorchRL's keyword), masked steps left out.
+        per_agent: standardize each agent's advantage by itself, in place of all agents' together.
         return_scale: a :class:`~pgkit.modules.ReturnScale`; the critic then works in its unit and so does
             ``value_target``, while ``advantage`` stays in the rewards' unit.
     """
@@ -37,11 +38,12 @@ class GAE(Advantage):
         gamma: float = 0.99,
         lmbda: float = 0.95,
         average_gae: bool = False,
+        per_agent: bool = False,
         return_scale: Any = None,
     ) -> None:
-        super().__init__(critic, gamma=gamma, standardize=average_gae, return_scale=return_scale)
+        super().__init__(critic, gamma=gamma, standardize=average_gae, per_agent=per_agent, return_scale=return_scale)
         within(0, 1, lmbda=lmbda)
-        self.register_buffer("lmbda", torch.tensor(float(lmbda)))
+        self.register_buffer("lmbda", torch.tensor(float(lmbda), dtype=torch.float64))
 
     def estimate(self, value: Tensor, next_value: Tensor, rollout: TensorDictBase) -> tuple[Tensor, Tensor]:
-        return generalized_advantage(value, next_value, *ends(rollout), self.gamma, self.lmbda)
+        return generalized_advantage(value, next_value, *self.ends(value, rollout), self.gamma, self.lmbda)

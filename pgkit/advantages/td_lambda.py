@@ -9,7 +9,8 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 
-from pgkit.advantages.base import Advantage, ends
+from pgkit.advantages.base import Advantage
+from pgkit.errors import check_whole_number, within
 from pgkit.functional import from_start, lambda_return, n_step_return
 
 
@@ -31,13 +32,15 @@ class TDLambda(Advantage):
         gamma: float = 0.99,
         lmbda: float = 0.95,
         standardize: bool = False,
+        per_agent: bool = False,
         return_scale: Any = None,
     ) -> None:
-        super().__init__(critic, gamma=gamma, standardize=standardize, return_scale=return_scale)
-        self.register_buffer("lmbda", torch.tensor(float(lmbda)))
+        super().__init__(critic, gamma=gamma, standardize=standardize, per_agent=per_agent, return_scale=return_scale)
+        within(0, 1, lmbda=lmbda)
+        self.register_buffer("lmbda", torch.tensor(float(lmbda), dtype=torch.float64))
 
     def estimate(self, value: Tensor, next_value: Tensor, rollout: TensorDictBase) -> tuple[Tensor, Tensor]:
-        target = lambda_return(next_value, *ends(rollout), self.gamma, self.lmbda)
+        target = lambda_return(next_value, *self.ends(value, rollout), self.gamma, self.lmbda)
         return target - value, target
 
 
@@ -57,13 +60,15 @@ class NStep(Advantage):
         gamma: float = 0.99,
         steps: int = 5,
         standardize: bool = False,
+        per_agent: bool = False,
         return_scale: Any = None,
     ) -> None:
-        super().__init__(critic, gamma=gamma, standardize=standardize, return_scale=return_scale)
+        super().__init__(critic, gamma=gamma, standardize=standardize, per_agent=per_agent, return_scale=return_scale)
+        check_whole_number(1, steps=steps)
         self.steps = steps
 
     def estimate(self, value: Tensor, next_value: Tensor, rollout: TensorDictBase) -> tuple[Tensor, Tensor]:
-        target = n_step_return(next_value, *ends(rollout), self.gamma, self.steps)
+        target = n_step_return(next_value, *self.ends(value, rollout), self.gamma, self.steps)
         return target - value, target
 
 
@@ -87,13 +92,14 @@ class MonteCarlo(Advantage):
         gamma: float = 0.99,
         reward_to_go: bool = True,
         standardize: bool = False,
+        per_agent: bool = False,
         return_scale: Any = None,
     ) -> None:
-        super().__init__(critic, gamma=gamma, standardize=standardize, return_scale=return_scale)
+        super().__init__(critic, gamma=gamma, standardize=standardize, per_agent=per_agent, return_scale=return_scale)
         self.reward_to_go = reward_to_go
 
     def estimate(self, value: Tensor, next_value: Tensor, rollout: TensorDictBase) -> tuple[Tensor, Tensor]:
-        reward, done, terminated = ends(rollout)
+        reward, done, terminated = self.ends(value, rollout)
         target = lambda_return(next_value, reward, done, terminated, self.gamma, 1.0)
         counted = target if self.reward_to_go else from_start(target, done)
         return counted - value, target

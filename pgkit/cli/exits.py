@@ -13,7 +13,8 @@ from types import TracebackType
 
 from pgkit.errors import Diverged, UserError
 
-LIBRARIES = (str(Path(__file__).parents[1]), *(path for path in sys.path if path.endswith("-packages")))
+PGKIT = str(Path(__file__).parents[1])
+OTHERS = tuple(path for path in sys.path if path.endswith("-packages"))
 
 
 @contextlib.contextmanager
@@ -39,9 +40,11 @@ def exits() -> Iterator[None]:
 
 
 def report(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-    """Prints an exception as one line, and below it the frames of the user's own code; all, where there are none."""
+    """Prints an exception as one line, and below it where in the user's own code it was raised, or else everything."""
     frames = traceback.extract_tb(trace)
-    own = [frame for frame in frames if frame.line and not frame.filename.startswith((*LIBRARIES, "<frozen"))]
+    pgkit = [number for number, frame in enumerate(frames) if frame.filename.startswith(PGKIT)]
+    own = [frame for frame in frames if frame.line and not frame.filename.startswith((PGKIT, *OTHERS, "<frozen"))]
+    raised_there = own and (not pgkit or frames.index(own[-1]) > pgkit[-1])
     text = " ".join(str(error).split()) or "no message"
     print(f"error: {kind.__name__}: {text}", file=sys.stderr)
-    print("".join(traceback.format_list(own or frames)), end="", file=sys.stderr)
+    print("".join(traceback.format_list(own if raised_there else frames)), end="", file=sys.stderr)

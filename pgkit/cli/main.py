@@ -8,7 +8,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import NoReturn
 
-from pgkit.cli import recipes
+from pgkit.cli import recipes, studies
+from pgkit.cli.beside import look_beside
 from pgkit.cli.exits import exits
 from pgkit.errors import UserError
 
@@ -23,7 +24,10 @@ class Parser(argparse.ArgumentParser):
 def main(argv: Sequence[str] | None = None) -> None:
     """Run one command: exit 2 and one line on a user's error, 3 on divergence, 130 on Ctrl-C."""
     with exits():
-        args = parser().parse_args(argv)
+        args, flags = parser().parse_known_args(argv)
+        if flags and not getattr(args, "takes_flags", False):
+            raise UserError(f"unrecognized arguments: {' '.join(flags)} (see pgkit --help)")
+        args.flags = flags or getattr(args, "flags", [])
         args.command(args)
 
 
@@ -63,6 +67,7 @@ def parser() -> Parser:
         "--x", choices=["frames", "wall"], default="frames", help="axis: frames, or minutes of training"
     )
     command.set_defaults(command=plot_runs)
+    studies.add(commands)
     return top
 
 
@@ -92,13 +97,13 @@ def list_recipes(_: argparse.Namespace) -> None:
 
 def copy_recipe(args: argparse.Namespace) -> None:
     source, target = recipes.find(args.recipe), args.file
-    if target.is_dir():
-        target = target / source.name
-    if target.suffix != ".py":
-        raise UserError(f"{target} is no name for a recipe: give one that ends in .py")
-    if not target.parent.is_dir():
-        raise UserError(f"no directory {target.parent} to copy into")
     try:
+        if target.is_dir():
+            target = target / source.name
+        if target.suffix != ".py":
+            raise UserError(f"{target} is no name for a recipe: give one that ends in .py")
+        if not target.parent.is_dir():
+            raise UserError(f"no directory {target.parent} to copy into")
         with target.open("xb") as file:  # exclusive: a link that waits there is not followed
             file.write(source.read_bytes())
     except FileExistsError:
@@ -111,9 +116,9 @@ def copy_recipe(args: argparse.Namespace) -> None:
 
 def run_recipe(args: argparse.Namespace) -> None:
     path = recipes.find(args.recipe)
-    if not recipes.is_shipped(path):  # as `python FILE` runs it; its folder comes last, so that it hides no module
+    if not recipes.is_shipped(path):  # as `python FILE` runs it, but what lies beside it hides no other module
         sys.argv = [args.recipe, *args.flags]
-        sys.path.append(str(path.resolve().parent))
+        look_beside(path)
         runpy.run_path(str(path), run_name="__main__")
         return
     recipe = recipes.load(path)

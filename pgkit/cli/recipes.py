@@ -8,6 +8,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from pgkit.cli.beside import look_beside
 from pgkit.errors import UserError
 
 
@@ -75,8 +76,9 @@ def load(path: Path) -> ModuleType:
         UserError: it has no ``main`` and ``Args``.
     """
     path = path.resolve()
-    if str(path.parent) not in sys.path:
-        sys.path.append(str(path.parent))  # worker processes import it by its name; last, it hides no other module
+    look_beside(path)
+    if is_shipped(path) and str(path.parent) not in sys.path:
+        sys.path.append(str(path.parent))  # workers import the recipe's classes by its name
     name = path.stem if _own_name(path) else f"{path.stem}_recipe"
     spec: Any = importlib.util.spec_from_file_location(name, path)
     module = sys.modules[name] = importlib.util.module_from_spec(spec)

@@ -15,7 +15,7 @@ from torch import Tensor
 from pgkit.collectors.policy import check_env, example, output_keys
 from pgkit.collectors.stepping import Arrays, as_rollout
 from pgkit.collectors.workers import Workers, shares
-from pgkit.compiling import worth_compiling
+from pgkit.compiled import choose
 from pgkit.envs import VectorEnv
 from pgkit.envs.arrays import episode_seed
 from pgkit.errors import UserError
@@ -81,7 +81,7 @@ class AsyncCollector:
         self.compile_seconds = 0.0  # starting the workers, which record and compile the policy
         self._steps = frames_per_batch // min(columns)
         calls = None if total_frames < 0 else total_frames / env.num_envs
-        self._compile = worth_compiling(compile, calls, least_calls=50_000)
+        self._compile = choose(compile, calls, least_calls=50_000)
         self._outputs = dict(zip(output_keys(actor), example(env, actor), strict=True))
         self._groups: list[Workers] = []
         self._updates = 0  # rollouts handed out: the caller makes one update with each

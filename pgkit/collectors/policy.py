@@ -16,7 +16,7 @@ from torchrl.data import MultiCategorical, TensorSpec
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import OrnsteinUhlenbeckProcessModule
 
-from pgkit.compiling import compile_record, record
+from pgkit.compiled import Mode, compiled, undone
 from pgkit.envs import VectorEnv
 from pgkit.envs.vector import whole
 from pgkit.errors import UserError
@@ -49,41 +49,54 @@ def memory(actor: TensorDictModuleBase, num_envs: int) -> dict[str, Tensor]:
 def trace(
     actor: TensorDictModuleBase,
     obs: Tensor,
-    compile: bool = False,
+    mode: Mode = "off",
     split: Callable[[Tensor], dict[str, Tensor]] = whole,
 ) -> Act:
     """A function from observations of the shape of ``obs`` to the tensors at :func:`output_keys`.
 
-    A recurrent actor's function takes the entries of :func:`memory` too. ``split`` makes entries of ``obs``.
+    It is :func:`policy`, bound. A recurrent actor's function takes the entries of :func:`memory` too. ``split`` makes
+    entries of ``obs``.
 
-    It is the actor's own sequence of tensor operations, recorded once (``make_fx``) and called without TensorDict:
-    the same numbers bit for bit, at about a quarter of the cost for a small network. ``compile`` hands the record to
-    inductor, which halves that again and rounds differently in the last bits. Parameters and buffers are referred to,
-    not copied, so weights changed in place take effect; plain attributes are fixed. An actor that cannot be recorded
-    (Python control flow that depends on data, numpy) is called as it is.
+    It is the actor's own sequence of tensor operations, recorded once and called without TensorDict: the same numbers
+    bit for bit, at about a quarter of the cost for a small network. Compiled, it halves that again and rounds
+    differently in the last bits. Parameters and buffers are referred to, not copied, so weights changed in place take
+    effect; plain attributes are fixed. An actor that cannot be recorded (Python control flow that depends on data,
+    numpy) is called as it is.
+
+    Args:
+        mode: of :func:`pgkit.compiled.compiled`; ``off`` records all the same, which changes no bit.
     """
+    with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
+        native, *inputs = policy(actor, obs, mode, split)
+        return native.bind(None, *inputs)
+
+
+def policy(
+    actor: TensorDictModuleBase,
+    obs: Tensor,
+    mode: Mode = "off",
+    split: Callable[[Tensor], dict[str, Tensor]] = whole,
+) -> tuple[Any, ...]:
+    """The actor behind the door to native code, and the inputs to bind it to: ``(compiled, obs, *memory)``."""
     keys = output_keys(actor)
-
     remembered = memory(actor, len(obs))
-    inputs = [obs, *remembered.values()]
 
-    def act(obs: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
+    def act(_: None, obs: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
         entries = split(obs) | dict(zip(remembered, state, strict=True))
         out = actor(TensorDict(entries, batch_size=obs.shape[:1]))
         return tuple(out[key] for key in keys)
 
-    with torch.no_grad(), torch.random.fork_rng(devices=[]), set_exploration_type(ExplorationType.RANDOM):
-        try:
-            with _LeavesTorch() as leaves:
-                graph = record(act, inputs)
-        except RuntimeError as error:
-            if "proxy" not in str(error) and "trac" not in str(error):
-                raise
-            return act
-        if leaves.seen or not _repeats(graph.forward, act, inputs):
-            getLogger("pgkit").info("the policy computes outside torch: it is called as it is, several times slower")
-            return act
-        return compile_record(graph, inputs) if compile else graph.forward
+    def others(_: None, obs: Tensor, *state: Tensor) -> list[tuple[Any, ...]]:
+        return [(None, _other(obs, seed, spread), *state) for seed, spread in enumerate((0.1, 1.0, 10.0))]
+
+    mode = "record" if mode == "off" else mode
+    with torch.no_grad(), _LeavesTorch() as leaves:
+        undone(actor.buffers(), lambda: act(None, obs, *remembered.values()))
+    if leaves.seen:
+        getLogger("pgkit").info("the policy computes outside torch: it is called as it is, several times slower")
+        mode = "off"
+    native = compiled(act, watch={"the actor": actor}, others=others, mode=mode, name="the policy")
+    return native, obs, *remembered.values()
 
 
 class _LeavesTorch(TorchFunctionMode):
@@ -96,17 +109,14 @@ class _LeavesTorch(TorchFunctionMode):
         return func(*args, **(kwargs or {}))
 
 
-def _repeats(graph: Act, act: Act, inputs: Sequence[Tensor]) -> bool:
-    """Whether a recorded policy does on other observations what the policy does; Python's numbers are constants."""
-    obs, *state = inputs
-    for _ in range(3):
-        other = obs + 0.1 * torch.rand_like(obs)
-        random = torch.get_rng_state()
-        expected = act(other, *state)
-        torch.set_rng_state(random)
-        if not all(torch.allclose(x, y, equal_nan=True) for x, y in zip(graph(other, *state), expected, strict=True)):
-            return False
-    return True
+def _other(obs: Tensor, seed: int, spread: float) -> Tensor:
+    """Other observations of the same type: noise on numbers, any pixels, flags and integers in another order."""
+    draw = torch.Generator(obs.device).manual_seed(seed)
+    if obs.dtype.is_floating_point:
+        return obs + spread * torch.randn(obs.shape, generator=draw, dtype=obs.dtype, device=obs.device)
+    if obs.dtype is torch.uint8:
+        return torch.randint(256, obs.shape, generator=draw, dtype=obs.dtype, device=obs.device)
+    return obs.flatten()[torch.randperm(obs.numel(), generator=draw, device=obs.device)].view_as(obs)
 
 
 def random_actions(

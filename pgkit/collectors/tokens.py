@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from pgkit.envs import Prompts
-from pgkit.errors import UserError, whole, within
+from pgkit.errors import UserError, check_whole_number, within
 
 
 class TokenCollector:
@@ -54,7 +54,7 @@ class TokenCollector:
         top_p: float = 1.0,
         reference: Any = None,
     ) -> None:
-        whole(1, total_frames=total_frames)
+        check_whole_number(1, total_frames=total_frames)
         within(0, 1, top_p=top_p)
         if group_size < 2:
             raise UserError(f"group_size={group_size}: a completion is measured against others, give at least 2")

@@ -14,11 +14,10 @@ from tensordict.nn import TensorDictModuleBase
 from pgkit.collectors.policy import Act, check_env, example, output_keys, random_actions, trace
 from pgkit.collectors.stepping import allocate, as_rollout, fill
 from pgkit.collectors.workers import Workers
-from pgkit.compiling import worth_compiling
-from pgkit.constants import Constants
+from pgkit.compiled import Constants, choose
 from pgkit.envs import VectorEnv
 from pgkit.envs.arrays import episode_seed
-from pgkit.errors import UserError, whole
+from pgkit.errors import UserError, check_whole_number
 
 
 class VectorCollector:
@@ -57,7 +56,7 @@ class VectorCollector:
         compile: str = "auto",
     ) -> None:
         check_env(env, self)
-        whole(1, frames_per_batch=frames_per_batch)
+        check_whole_number(1, frames_per_batch=frames_per_batch)
         if frames_per_batch % env.num_envs:
             raise UserError(
                 f"frames_per_batch={frames_per_batch} is not a multiple of the {env.num_envs} environments: each takes "
@@ -75,7 +74,7 @@ class VectorCollector:
         self.compile_seconds = 0.0  # recording and compiling the policy, starting the workers
         self._steps = frames_per_batch // env.num_envs
         steps = None if total_frames < 0 else total_frames / env.num_envs
-        self._compile = worth_compiling(compile, steps, least_calls=50_000)
+        self._compile = choose(compile, steps, least_calls=50_000)
         self._keys = output_keys(actor)
         self._outputs = dict(zip(self._keys, example(env, actor), strict=True))
         self._workers: Workers | None = None
@@ -127,7 +126,7 @@ class VectorCollector:
         state = None
         if self._workers is not None and changed:
             getLogger("pgkit").warning(
-                "the workers start again: in the actor %s (a buffer changed in place, by fill_, needs no such thing)",
+                "the workers start again: %s (a buffer changed in place, by fill_, needs no such thing)",
                 changed,
             )
             state = self._workers.state_dict()
@@ -135,7 +134,7 @@ class VectorCollector:
             self._workers = None
         if self._workers is None:
             start = time.perf_counter()
-            self._constants = Constants(self.actor)
+            self._constants = Constants({"the actor": self.actor})
             self._workers = Workers(self.env, self.actor, self._steps, self._outputs, self._compile)
             self.compile_seconds += time.perf_counter() - start
             if state is not None:
@@ -147,7 +146,7 @@ class VectorCollector:
         if self._act is None or self._constants is None or self._constants.changed():
             start = time.perf_counter()
             obs = torch.from_numpy(self.env.arrays.obs)
-            self._constants = Constants(self.actor)
+            self._constants = Constants({"the actor": self.actor})
             self._act = trace(self.actor, obs, self._compile, self.env.split)
             self.compile_seconds += time.perf_counter() - start
         return self._act

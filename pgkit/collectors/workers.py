@@ -23,6 +23,7 @@ from torchrl.data import TensorSpec
 
 from pgkit.collectors.policy import random_actions, trace
 from pgkit.collectors.stepping import Arrays, allocate, fill
+from pgkit.compiled import Mode
 from pgkit.envs import ArrayEnv, VectorEnv
 from pgkit.errors import UserError
 
@@ -51,7 +52,7 @@ class Workers:
         actor: TensorDictModuleBase,
         steps: int,
         outputs: dict[NestedKey, Tensor],
-        compile: bool,
+        compile: Mode,
         bounds: Sequence[int] | None = None,
     ) -> None:
         self._actor = copy.deepcopy(actor).requires_grad_(False).share_memory()
@@ -174,7 +175,7 @@ class _Share(NamedTuple):
     actor: TensorDictModuleBase
     outputs: dict[NestedKey, Tensor]
     shared: dict[NestedKey, Tensor]
-    compile: bool
+    compile: Mode
     split: Callable[[Tensor], dict[str, Tensor]]
 
 

@@ -35,7 +35,7 @@ class AdaptiveKL(nn.Module):
     ) -> None:
         super().__init__()
         self.target, self.increment, self.decrement, self.bounds = target, increment, decrement, bounds
-        self.register_buffer("beta", torch.tensor(float(beta)))
+        self.register_buffer("beta", torch.tensor(float(beta), dtype=torch.float64))
 
     @torch.no_grad()
     def update(self, kl: Tensor) -> float:
@@ -55,7 +55,7 @@ class FixedKL(nn.Module):
 
     def __init__(self, beta: float) -> None:
         super().__init__()
-        self.register_buffer("beta", torch.tensor(float(beta)))
+        self.register_buffer("beta", torch.tensor(float(beta), dtype=torch.float64))
 
     def update(self, kl: Tensor) -> float:
         """Returns the coefficient."""

@@ -24,6 +24,8 @@ class Temperature(nn.Module):
         min_alpha, max_alpha: bounds of :math:`\alpha`; None: none.
     """
 
+    target_entropy: Tensor
+
     def __init__(
         self,
         target_entropy: float,
@@ -35,7 +37,9 @@ class Temperature(nn.Module):
         super().__init__()
         if alpha_init <= 0:
             raise UserError(f"alpha_init={alpha_init:g}: give a number above 0 (FixedTemperature(0) for none)")
-        self.target_entropy = float(target_entropy)
+        self.register_buffer(
+            "target_entropy", torch.tensor(float(target_entropy), dtype=torch.float64), persistent=False
+        )
         self.bounds = (log(min_alpha) if min_alpha else None, log(max_alpha) if max_alpha else None)
         self.log_alpha = nn.Parameter(torch.tensor(log(alpha_init)))
 
@@ -61,7 +65,7 @@ class FixedTemperature(nn.Module):
 
     def __init__(self, alpha: float) -> None:
         super().__init__()
-        self.register_buffer("alpha", torch.tensor(float(alpha)))
+        self.register_buffer("alpha", torch.tensor(float(alpha), dtype=torch.float64))
 
     def loss(self, log_prob: Tensor) -> Tensor:
         """Zeros ``[*B]``."""

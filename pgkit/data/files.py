@@ -1,4 +1,4 @@
-"""A replay buffer's state, as a dict and as a file of its own."""
+"""States in files of their own, and storages in files."""
 
 from __future__ import annotations
 
@@ -9,69 +9,41 @@ from collections.abc import Callable
 from functools import partial
 from logging import getLogger
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
+import torch
 from torchrl.data import LazyMemmapStorage
 from torchrl.data.replay_buffers import TensorStorage
 
 from pgkit import files
 from pgkit.errors import UserError
-
-if TYPE_CHECKING:
-    from pgkit.data.replay import ReplayBuffer
+from pgkit.seams import Stateful
 
 _log = getLogger("pgkit")
 
 
-def state(buffer: ReplayBuffer) -> dict[str, Any]:
-    """The rows in use, the counters and the generator."""
-    frames, finals = min(buffer.written + buffer.columns, buffer.rows), min(buffer.finals, buffer.final_rows)
-    return {
-        "made_for": _made_for(buffer),
-        "counters": (buffer.written, buffer.start, buffer.finals),
-        "owner": buffer.owner[:finals].clone(),
-        "generator": buffer.generator.get_state(),
-        "frames": {key: x[:frames].clone() for key, x in buffer.frames.items()},
-        "observations": {key: x[:frames].clone() for key, x in buffer.observations.items()},
-        "finals": {key: x[buffer.rows :][:finals].clone() for key, x in buffer.observations.items()},
-        "sampler": None if buffer.sampler is None else buffer.sampler.state_dict(),
-    }
-
-
-def restore(buffer: ReplayBuffer, saved: dict[str, Any]) -> None:
-    """Loads :func:`state` into a buffer made alike."""
-    theirs, mine = saved["made_for"], _made_for(buffer)
-    for name, value in mine.items():
-        if theirs.get(name) != value:
-            raise UserError(
-                f"the saved replay buffer is another one: its {name} is {theirs.get(name)}, here it is {value}; "
-                "give the same environment and settings, or train without the saved buffer"
-            )
-    buffer.clear()
-    buffer.written, buffer.start, buffer.finals = saved["counters"]
-    buffer.owner[: len(saved["owner"])] = saved["owner"]
-    buffer.generator.set_state(saved["generator"])
-    for key, x in saved["frames"].items():
-        buffer.frames[key][: len(x)] = x
-    for key, x in saved["observations"].items():
-        buffer.observations[key][: len(x)] = x
-    for key, x in saved["finals"].items():
-        buffer.observations[key][buffer.rows : buffer.rows + len(x)] = x
-    if buffer.sampler is not None:
-        buffer.sampler.load_state_dict(saved["sampler"])
-
-
-def save(buffer: ReplayBuffer, path: Path) -> None:
+def save(owner: Stateful, path: Path) -> None:
     """Writes the state to ``path``: a crash leaves the old file or the new one."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    files.save(path, state(buffer))
+    files.save(path, owner.state_dict())
 
 
-def load(buffer: ReplayBuffer, path: Path) -> None:
-    """Reads what :func:`save` wrote."""
+def load(owner: Stateful, path: Path) -> None:
+    """Reads what :func:`save` wrote.
+
+    Raises:
+        UserError: there is no such file, or it is damaged.
+    """
     if not path.is_file():
         raise UserError(f"there is no saved replay buffer at {path}")
-    restore(buffer, files.load(path))
+    saved = files.load(path)
+    try:
+        owner.load_state_dict(saved)
+    except UserError:
+        raise
+    except (RuntimeError, LookupError, TypeError, ValueError) as error:
+        reason = next(iter(str(error).strip().splitlines()), "entries are missing")
+        raise UserError(f"{path} is no saved replay buffer ({reason}): train without it") from error
 
 
 def in_files(folder: str | Path) -> Callable[[int], TensorStorage]:
@@ -92,19 +64,15 @@ def in_files(folder: str | Path) -> Callable[[int], TensorStorage]:
     return partial(LazyMemmapStorage, scratch_dir=own)
 
 
-def _made_for(buffer: ReplayBuffer) -> dict[str, Any]:
-    shapes = {str(key): tuple(x.shape[1:]) for key, x in buffer.observations.items()}
-    return {
-        "environment": buffer.env_name,
-        "observation": shapes,
-        "action": tuple(buffer.frames["action"].shape[1:]),
-        "entries": {key: tuple(buffer.frames[key].shape[1:]) for key in buffer.entries},
-        "num_envs": buffer.columns,
-        "n_steps": buffer.n_steps,
-        "capacity": buffer.capacity,
-        "final_rows": buffer.final_rows,
-        "prioritized": buffer.sampler is not None,
-    }
+class Replay(Stateful, Protocol):
+    """What a checkpoint needs of a replay buffer; ``written`` counts the frames it ever stored."""
+
+    generator: torch.Generator
+
+    @property
+    def written(self) -> int: ...
+
+    def clear(self) -> None: ...
 
 
 class BesideCheckpoint:
@@ -119,7 +87,7 @@ class BesideCheckpoint:
     has its own.
     """
 
-    def __init__(self, buffer: ReplayBuffer, path: Path, save: bool) -> None:
+    def __init__(self, buffer: Replay, path: Path, save: bool) -> None:
         self.buffer, self.path, self.save = buffer, path, save
 
     def state_dict(self) -> dict[str, Any]:

@@ -35,9 +35,10 @@ class Prioritized:
         """What :meth:`write_back` changes."""
         return [self.tree.values, self.tree.sums, self.largest]
 
-    def begin(self, rows: int) -> TensorDictBase:
+    def begin(self, rows: int, device: torch.device | str = "cpu") -> TensorDictBase:
         """Makes the tree; the result is what a batch's weights are made from."""
-        self.tree = SumTree(rows)
+        self.tree = SumTree(rows, device)
+        self.beta, self.largest = self.beta.to(device), self.largest.to(device)
         return TensorDict({"priority": self.tree.values, "beta": self.beta})
 
     def set_beta(self, beta: float) -> None:
@@ -50,9 +51,9 @@ class Prioritized:
         self.tree.set(new, self.largest)
 
     def sample(self, batches: int, batch_size: int, generator: torch.Generator) -> Tensor:
-        """Rows ``[batches, batch_size]``."""
+        """Rows ``[batches, batch_size]``; drawn on the CPU, the generator's device."""
         share = torch.rand(batches * batch_size, generator=generator, dtype=torch.float64)
-        return self.tree.find(share).view(batches, batch_size)
+        return self.tree.find(share.to(self.tree.sums.device)).view(batches, batch_size)
 
     def write_back(self, index: Tensor, td_error: Tensor) -> None:
         """Makes the errors ``[B]`` the priorities of the rows ``index [B]``; compiles into the update."""
@@ -72,4 +73,4 @@ class Prioritized:
         """Restores :meth:`state_dict`."""
         self.largest.copy_(state["largest"])
         self.beta.copy_(state["beta"])
-        self.tree.set(torch.arange(len(self.tree.values)), state["priority"])
+        self.tree.set(torch.arange(len(self.tree.values)), state["priority"].to(self.tree.values.device))

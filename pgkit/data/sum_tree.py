@@ -24,13 +24,14 @@ class SumTree:
         sums: of each block.
     """
 
-    def __init__(self, size: int) -> None:
+    def __init__(self, size: int, device: torch.device | str = "cpu") -> None:
         blocks = -(-size // BLOCK)
-        self.values = torch.zeros(blocks * BLOCK, dtype=torch.float64)
-        self.sums = torch.zeros(blocks, dtype=torch.float64)
+        self.values = torch.zeros(blocks * BLOCK, dtype=torch.float64, device=device)
+        self.sums = torch.zeros(blocks, dtype=torch.float64, device=device)
 
     def set(self, index: Tensor, value: Tensor | float) -> None:
         """Sets the numbers at ``index [B]`` (of equal indices, one wins)."""
+        index = index.to(self.values.device)
         self.values[index] = value
         block = index // BLOCK
         self.sums[block] = self.values.view(-1, BLOCK)[block].sum(-1)

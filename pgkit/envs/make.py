@@ -14,7 +14,7 @@ from torchrl.envs import EnvBase
 
 from pgkit.envs.action_repeat import ActionRepeat
 from pgkit.envs.vector import VectorEnv
-from pgkit.errors import UserError, whole
+from pgkit.errors import UserError, check_whole_number
 
 
 def make(
@@ -54,8 +54,8 @@ def make(
         )
     if seed is None:
         raise UserError("seed=None: give a whole number; numpy.random.randint(2**31) is another in every run")
-    whole(0, seed=seed, num_envs=num_envs, workers=workers)
-    whole(1, action_repeat=action_repeat)
+    check_whole_number(0, seed=seed, num_envs=num_envs, workers=workers)
+    check_whole_number(1, action_repeat=action_repeat)
     if num_envs < 1 or workers < 1 or workers > num_envs:
         raise UserError(
             f"num_envs={num_envs}, workers={workers}: every worker needs at least one environment; "
@@ -172,7 +172,7 @@ def _make_dm_control(env_id: str, **kwargs: Any) -> gym.Env:
 def _unknown(env_id: str, known: list[str]) -> UserError:
     nearest = difflib.get_close_matches(env_id, known, n=3, cutoff=0.4)
     hint = f"; the nearest names are {', '.join(nearest)}" if nearest else "; see gymnasium.pprint_registry()"
-    return UserError(f"unknown environment id '{env_id}'{hint}")
+    return UserError(f"unknown environment id '{env_id}'{hint}; where a package registers it: PACKAGE:{env_id}")
 
 
 def _extra(env_id: str) -> str:

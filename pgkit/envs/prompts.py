@@ -19,7 +19,7 @@ from pgkit.envs.prompt_arrays import PromptArrays
 from pgkit.envs.prompt_gym import GymTask
 from pgkit.envs.prompt_tasks import Addition, Countdown, Reward, Sorting, Task
 from pgkit.envs.tokenizers import Characters, Tokenizer
-from pgkit.errors import UserError, whole
+from pgkit.errors import UserError, check_whole_number
 from pgkit.seams import Entries, Step
 
 TASKS: dict[str, Callable[[], Task]] = {"addition": Addition, "sorting": Sorting, "countdown": Countdown}
@@ -65,7 +65,7 @@ def prompts(
         )
     if missing := [name for name, length in lengths.items() if not length]:
         raise UserError(f"prompts of your own need {missing[0]}=, in tokens")
-    whole(1, batch=batch, **lengths)
+    check_whole_number(1, batch=batch, **lengths)
     return Prompts(
         made,
         batch,

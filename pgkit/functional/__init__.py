@@ -13,6 +13,7 @@ from pgkit.functional.distributional import (
     two_hot,
 )
 from pgkit.functional.group_relative import batch_relative, group_relative, has_spread, leave_one_out
+from pgkit.functional.images import quantized_pixels, shift_images
 from pgkit.functional.returns import discounted_sum, generalized_advantage
 from pgkit.functional.smoothing import smoothed_action
 from pgkit.functional.soft import (
@@ -67,11 +68,13 @@ __all__ = [
     "policy_gradient",
     "quadratic_surrogate",
     "quantile_huber",
+    "quantized_pixels",
     "random_subset",
     "ratio_surrogate",
     "rollback_surrogate",
     "same_shape",
     "sequence_log_ratio",
+    "shift_images",
     "smoothed_action",
     "soft_returns",
     "standardize",

@@ -11,7 +11,8 @@ from pgkit.functional.checks import is_flag, same_shape
 def discounted_sum(x: Tensor, factor: Tensor) -> Tensor:
     r"""Backward linear recurrence :math:`y_t = x_t + f_t\, y_{t+1}`, with :math:`y_T = 0`.
 
-    A parallel scan: ``ceil(log2 T)`` vectorized steps in place of ``T`` (Hillis and Steele, 1986).
+    A parallel scan: ``ceil(log2 T)`` vectorized steps in place of ``T`` (Hillis and Steele, 1986). Where a factor is 0
+    the sum ends: a NaN or an infinity beyond it stays there.
 
     Args:
         x: ``[*B, T, 1]``.
@@ -25,7 +26,9 @@ def discounted_sum(x: Tensor, factor: Tensor) -> Tensor:
     while shift < steps:
         # invariant: x_t sums the terms t .. t + shift - 1, factor_t multiplies what follows them
         head, tail = x[..., :-shift, :], x[..., shift:, :]
-        x = torch.cat([head + factor[..., : steps - shift, :] * tail, x[..., steps - shift :, :]], -2)
+        weight = factor[..., : steps - shift, :]
+        head = torch.where(weight == 0, head, head + weight * tail)  # 0 * inf is NaN
+        x = torch.cat([head, x[..., steps - shift :, :]], -2)
         factor = factor[..., : max(steps - 2 * shift, 0), :] * factor[..., shift : steps - shift, :]
         shift *= 2
     return x
@@ -63,6 +66,6 @@ def generalized_advantage(
     """
     same_shape(value=value, next_value=next_value, reward=reward, done=done, terminated=terminated)
     is_flag(done=done, terminated=terminated)
-    delta = reward + gamma * next_value * ~terminated - value
+    delta = reward + gamma * next_value.masked_fill(terminated, 0.0) - value
     advantage = discounted_sum(delta, gamma * lmbda * (~done).to(delta.dtype))
     return advantage, advantage + value

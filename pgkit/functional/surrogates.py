@@ -7,6 +7,8 @@ from torch import Tensor
 
 from pgkit.functional.checks import same_shape
 
+_MOST = 40.0  # a log-ratio: beyond 88, exp is infinite in float32, and its square, in a gradient's norm, beyond 44
+
 
 def policy_gradient(log_prob: Tensor, advantage: Tensor) -> Tensor:
     r"""The objective :math:`\log \pi(a|s)\, A`, whose gradient is the policy gradient (Sutton et al., 2000).
@@ -49,10 +51,10 @@ def clip_surrogate(
         clip_high: :math:`\epsilon_{high}`; ``clip_low`` if None (larger in DAPO, https://arxiv.org/abs/2503.14476).
 
     Returns:
-        Same shape, unreduced.
+        Same shape, unreduced; value and gradient are finite for any log-ratio.
     """
     same_shape(log_ratio=log_ratio, advantage=advantage)
-    ratio = log_ratio.exp()
+    ratio = log_ratio.clamp(max=_MOST).exp()
     clipped = ratio.clamp(1 - clip_low, 1 + (clip_low if clip_high is None else clip_high))
     return torch.minimum(ratio * advantage, clipped * advantage)
 

@@ -37,7 +37,7 @@ def lambda_return(
     """
     cut = cuts(next_value, reward, done, terminated)
     weight = gamma * lmbda * (~cut).to(reward.dtype)
-    return discounted_sum(reward + (gamma - weight) * next_value * ~terminated, weight)
+    return discounted_sum(reward + (gamma - weight) * next_value.masked_fill(terminated, 0.0), weight)
 
 
 def n_step_return(
@@ -49,7 +49,7 @@ def n_step_return(
     there, a termination does not. Arguments as in :func:`lambda_return`.
     """
     cut = cuts(next_value, reward, done, terminated)
-    value = next_value * ~terminated
+    value = next_value.masked_fill(terminated, 0.0)
     result = reward + gamma * value
     for _ in range(steps - 1):
         longer = torch.cat([result[..., 1:, :], value[..., -1:, :]], -2)

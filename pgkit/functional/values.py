@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 import torch.nn.functional as F
@@ -41,12 +41,13 @@ def clipped_value_loss(
     return torch.maximum(value_loss(value, target, kind), value_loss(clipped, target, kind))
 
 
-def standardize(x: Tensor, mask: Tensor | None = None) -> Tensor:
+def standardize(x: Tensor, mask: Tensor | None = None, dim: Sequence[int] | None = None) -> Tensor:
     """``x`` with zero mean and unit deviation over its elements, or over those of ``mask``, of its shape.
 
+    With ``dim``, over these dimensions only: every index of the others has a mean and a deviation of its own.
     A single element becomes zero; a deviation below 1e-6 counts as that.
     """
-    centered, squares, count = _centered(x, mask)
+    centered, squares, count = _centered(x, mask, dim)
     deviation = (squares / (count - 1).clamp_min(1)).sqrt()
     return centered / deviation.clamp_min(1e-6)
 
@@ -62,9 +63,14 @@ def explained_variance(value: Tensor, target: Tensor, mask: Tensor | None = None
     return 1 - unexplained / total.clamp_min(1e-12 * count)
 
 
-def _centered(x: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+def _centered(x: Tensor, mask: Tensor | None, dim: Sequence[int] | None = None) -> tuple[Tensor, Tensor, Tensor]:
     """``x`` less its mean, the sum of the squares of that, and how many elements count."""
-    weight = torch.ones_like(x) if mask is None else mask.to(x.dtype)
-    count = weight.sum()
-    centered = x - (weight * x).sum() / count
-    return centered, (weight * centered.square()).sum(), count
+    axes = list(range(x.dim()) if dim is None else dim)
+
+    def total(y: Tensor) -> Tensor:
+        y = y if mask is None else y.masked_fill(~mask, 0.0)  # a masked element may be NaN
+        return y.sum(axes, keepdim=dim is not None)
+
+    count = total(torch.ones_like(x))
+    centered = x - total(x) / count
+    return centered, total(centered.square()), count

@@ -52,11 +52,11 @@ def vtrace(
     """
     same_shape(log_ratio=log_ratio, value=value, next_value=next_value)
     cut = cuts(next_value, reward, done, terminated)
-    ratio, alive = log_ratio.exp(), ~terminated
+    ratio = log_ratio.exp()
     rho, c = ratio.clamp(max=rho_thresh), lmbda * ratio.clamp(max=c_thresh)
-    delta = rho * (reward + gamma * next_value * alive - value)
-    excess = discounted_sum(delta, gamma * c * ~done)
+    delta = rho * (reward + gamma * next_value.masked_fill(terminated, 0.0) - value)
+    excess = discounted_sum(delta, (gamma * c).masked_fill(done, 0.0))
     target = value + excess
     following = torch.cat([target[..., 1:, :], next_value[..., -1:, :]], -2)
     bootstrap = torch.where(cut, next_value, lmbda * following + (1 - lmbda) * next_value)
-    return rho * (reward + gamma * bootstrap * alive - value), target
+    return rho * (reward + gamma * bootstrap.masked_fill(terminated, 0.0) - value), target

@@ -6,14 +6,12 @@ from typing import Protocol, runtime_checkable
 
 from torch import Tensor
 
+from pgkit.heads.returns import Returns
+
 
 @runtime_checkable
 class Head(Protocol):
-    """What ``size`` outputs of each critic stand for. It holds settings and no parameters.
-
-    A target is a distribution of the return: atoms ``[*B, K]`` with weights ``[*B, K]`` that sum to 1. The loss moves
-    the atoms (:math:`r + \\gamma z`), the weights stay.
-    """
+    """What ``size`` outputs of each critic stand for. It holds settings and no parameters."""
 
     size: int
 
@@ -21,10 +19,14 @@ class Head(Protocol):
         """The critics' values: ``[*B, critics, size] -> [*B, critics]``."""
         ...
 
-    def pool(self, out: Tensor) -> tuple[Tensor, Tensor]:
-        """The target distribution of several critics, ``[*B, critics, size] -> ([*B, K], [*B, K])``."""
+    def returns(self, out: Tensor) -> Returns:
+        """What one critic says of the return: ``[*B, size] -> [*B]``."""
         ...
 
-    def loss(self, out: Tensor, atoms: Tensor, weights: Tensor) -> Tensor:
-        """Each critic's distance from the target, ``[*B, critics, size], [*B, K], [*B, K] -> [*B, critics]``."""
+    def least(self, out: Tensor) -> Returns:
+        """What several critics say of the return, with the least optimism: ``[*B, critics, size] -> [*B]``."""
+        ...
+
+    def loss(self, out: Tensor, target: Returns) -> Tensor:
+        """Each critic's distance from the target, ``[*B, critics, size], [*B] -> [*B, critics]``."""
         ...

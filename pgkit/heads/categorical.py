@@ -10,10 +10,34 @@ from torch import Tensor
 
 from pgkit.errors import UserError
 from pgkit.functional import categorical_mean, categorical_projection, cross_entropy, hl_gauss
+from pgkit.heads.returns import Returns
 
 
 @dataclass(frozen=True)
-class Bins:
+class _Range:
+    """Bins between a least and a largest return."""
+
+    low: float
+    high: float
+    size: int = 101
+
+    def __post_init__(self) -> None:
+        if not (self.low < self.high and self.size > 1):
+            raise UserError(
+                f"{self.size} bins from {self.low} to {self.high}: give at least 2, from a lower to a higher return"
+            )
+
+    def support(self, out: Tensor) -> Tensor:
+        """The bins' returns ``[size]``, of the type of ``out``."""
+        return torch.linspace(self.low, self.high, self.size, dtype=out.dtype, device=out.device)
+
+    def mean(self, out: Tensor) -> Tensor:
+        """``[*B, critics, size] -> [*B, critics]``."""
+        return categorical_mean(out, self.support(out))
+
+
+@dataclass(frozen=True)
+class Bins(_Range):
     """The expected return, learnt as a classification; the target is the least of the critics' means.
 
     Farebrother et al., 2024 (https://arxiv.org/abs/2403.03950). Returns beyond the range count as its ends.
@@ -25,31 +49,23 @@ class Bins:
             :func:`pgkit.functional.hl_gauss` or :func:`pgkit.functional.two_hot`.
     """
 
-    low: float
-    high: float
-    size: int = 101
     project: Callable[[Tensor, Tensor], Tensor] = hl_gauss
 
-    def __post_init__(self) -> None:
-        _check(self.low, self.high, self.size)
+    def returns(self, out: Tensor) -> Returns:
+        """The mean, with certainty."""
+        return Returns.certain(self.mean(out))
 
-    def mean(self, out: Tensor) -> Tensor:
-        """``[*B, critics, size] -> [*B, critics]``."""
-        return categorical_mean(out, _support(self, out))
+    def least(self, out: Tensor) -> Returns:
+        """The least of the critics' means, with certainty."""
+        return Returns.certain(self.mean(out).amin(-1))
 
-    def pool(self, out: Tensor) -> tuple[Tensor, Tensor]:
-        """One atom: the least of the critics' means."""
-        least = self.mean(out).amin(-1, keepdim=True)
-        return least, torch.ones_like(least)
-
-    def loss(self, out: Tensor, atoms: Tensor, weights: Tensor) -> Tensor:
-        """Cross-entropy of each critic to the one atom's bins."""
-        target = self.project(atoms.squeeze(-1), _support(self, out))
-        return cross_entropy(out, target.unsqueeze(-2).expand_as(out))
+    def loss(self, out: Tensor, target: Returns) -> Tensor:
+        """Cross-entropy of each critic to the bins of the target's mean."""
+        return cross_entropy(out, self.project(target.mean, self.support(out)).unsqueeze(-2).expand_as(out))
 
 
 @dataclass(frozen=True)
-class Categorical:
+class Categorical(_Range):
     """The whole distribution of the return on fixed atoms; the target is that of the critic whose mean is the least.
 
     Bellemare et al., 2017 (https://arxiv.org/abs/1707.06887). Atoms moved beyond the range count as its ends.
@@ -59,33 +75,17 @@ class Categorical:
         size: atoms of each critic.
     """
 
-    low: float
-    high: float
-    size: int = 101
+    def returns(self, out: Tensor) -> Returns:
+        """The support with the critic's probabilities."""
+        weights = out.softmax(-1)
+        return Returns(self.support(out).expand_as(weights), weights)
 
-    def __post_init__(self) -> None:
-        _check(self.low, self.high, self.size)
-
-    def mean(self, out: Tensor) -> Tensor:
-        """``[*B, critics, size] -> [*B, critics]``."""
-        return categorical_mean(out, _support(self, out))
-
-    def pool(self, out: Tensor) -> tuple[Tensor, Tensor]:
-        """The support, with the probabilities of the critic whose mean is the least."""
+    def least(self, out: Tensor) -> Returns:
+        """The support with the probabilities of the critic whose mean is the least."""
         which = self.mean(out).argmin(-1)[..., None, None].expand(*out.shape[:-2], 1, out.shape[-1])
-        weights = out.gather(-2, which).squeeze(-2).softmax(-1)
-        return _support(self, out).expand_as(weights), weights
+        return self.returns(out.gather(-2, which).squeeze(-2))
 
-    def loss(self, out: Tensor, atoms: Tensor, weights: Tensor) -> Tensor:
-        """Cross-entropy of each critic to the atoms, projected back on the support."""
-        target = categorical_projection(atoms, weights, _support(self, out))
-        return cross_entropy(out, target.unsqueeze(-2).expand_as(out))
-
-
-def _support(head: Bins | Categorical, out: Tensor) -> Tensor:
-    return torch.linspace(head.low, head.high, head.size, dtype=out.dtype, device=out.device)
-
-
-def _check(low: float, high: float, size: int) -> None:
-    if not (low < high and size > 1):
-        raise UserError(f"{size} bins from {low} to {high}: give at least 2, from a lower to a higher return")
+    def loss(self, out: Tensor, target: Returns) -> Tensor:
+        """Cross-entropy of each critic to the target's atoms, projected back on the support."""
+        probabilities = categorical_projection(target.atoms, target.weights, self.support(out))
+        return cross_entropy(out, probabilities.unsqueeze(-2).expand_as(out))

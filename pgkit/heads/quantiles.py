@@ -9,6 +9,7 @@ from torch import Tensor
 
 from pgkit.errors import UserError
 from pgkit.functional import quantile_huber
+from pgkit.heads.returns import Returns
 
 
 @dataclass(frozen=True)
@@ -20,7 +21,7 @@ class Quantiles:
 
     Args:
         size: quantiles of each critic.
-        drop: atoms left out for each critic in the pool.
+        drop: atoms left out of the target for each critic.
         kappa: width of the Huber distance's square part.
     """
 
@@ -38,15 +39,20 @@ class Quantiles:
         """``[*B, critics, size] -> [*B, critics]``."""
         return out.mean(-1)
 
-    def pool(self, out: Tensor) -> tuple[Tensor, Tensor]:
+    def returns(self, out: Tensor) -> Returns:
+        """The critic's atoms, sorted, without the ``drop`` largest."""
+        return self.least(out.unsqueeze(-2))
+
+    def least(self, out: Tensor) -> Returns:
         """All critics' atoms, sorted, without the ``drop * critics`` largest; a ``UserError`` if none is left."""
         if self.drop >= out.shape[-1]:
             raise UserError(f"drop={self.drop} of {out.shape[-1]} quantiles of each critic: it must leave at least one")
         atoms = out.flatten(-2).sort(-1).values
         atoms = atoms[..., : atoms.shape[-1] - self.drop * out.shape[-2]]
-        return atoms, torch.full_like(atoms, 1 / atoms.shape[-1])
+        return Returns(atoms, torch.full_like(atoms, 1 / atoms.shape[-1]))
 
-    def loss(self, out: Tensor, atoms: Tensor, weights: Tensor) -> Tensor:
-        """Quantile regression of each critic towards all the atoms."""
-        shape = (*out.shape[:-1], atoms.shape[-1])
-        return quantile_huber(out, atoms.unsqueeze(-2).expand(shape), weights.unsqueeze(-2).expand(shape), self.kappa)
+    def loss(self, out: Tensor, target: Returns) -> Tensor:
+        """Quantile regression of each critic towards all the target's atoms."""
+        shape = (*out.shape[:-1], target.atoms.shape[-1])
+        atoms, weights = (x.unsqueeze(-2).expand(shape) for x in (target.atoms, target.weights))
+        return quantile_huber(out, atoms, weights, self.kappa)

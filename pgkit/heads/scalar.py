@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
 from pgkit.functional import value_loss
+from pgkit.heads.returns import Returns
 
 
 @dataclass(frozen=True)
@@ -25,11 +25,14 @@ class Scalar:
         """``[*B, critics, 1] -> [*B, critics]``."""
         return out.squeeze(-1)
 
-    def pool(self, out: Tensor) -> tuple[Tensor, Tensor]:
-        """One atom: the least of the critics."""
-        least = out.amin(-2)
-        return least, torch.ones_like(least)
+    def returns(self, out: Tensor) -> Returns:
+        """The one number, with certainty."""
+        return Returns.certain(out.squeeze(-1))
 
-    def loss(self, out: Tensor, atoms: Tensor, weights: Tensor) -> Tensor:
-        """Distance of each critic from the one atom."""
-        return value_loss(out, atoms.unsqueeze(-2).expand_as(out), self.distance).squeeze(-1)
+    def least(self, out: Tensor) -> Returns:
+        """The least of the critics."""
+        return self.returns(out.amin(-2))
+
+    def loss(self, out: Tensor, target: Returns) -> Tensor:
+        """Distance of each critic from the target's mean."""
+        return value_loss(out, target.mean[..., None, None].expand_as(out), self.distance).squeeze(-1)

@@ -1,7 +1,6 @@
 """Losses: one file an algorithm, each a TorchRL ``LossModule``."""
 
 from pgkit.losses.a2c import A2CLoss
-from pgkit.losses.actor_critic_base import ActorCriticLoss
 from pgkit.losses.base import Loss
 from pgkit.losses.clip_ppo import ClipPPOLoss
 from pgkit.losses.crossq import CrossQLoss
@@ -9,13 +8,14 @@ from pgkit.losses.ddpg import DDPGLoss
 from pgkit.losses.discrete_sac import DiscreteSACLoss
 from pgkit.losses.grpo import GRPOLoss
 from pgkit.losses.kl_pen_ppo import KLPENPPOLoss
-from pgkit.losses.policy_base import PolicyLoss
+from pgkit.losses.policy_base import ActorCriticLoss, PolicyLoss
 from pgkit.losses.q_base import QLoss
 from pgkit.losses.redq import REDQLoss
 from pgkit.losses.reinforce import ReinforceLoss
 from pgkit.losses.sac import SACLoss
 from pgkit.losses.sft import SFTLoss
 from pgkit.losses.soft_base import SoftQLoss
+from pgkit.losses.sum import Sum
 from pgkit.losses.td3 import TD3Loss
 from pgkit.losses.tqc import TQCLoss
 from pgkit.losses.trpo import TRPOLoss
@@ -37,6 +37,7 @@ __all__ = [
     "SACLoss",
     "SFTLoss",
     "SoftQLoss",
+    "Sum",
     "TD3Loss",
     "TQCLoss",
     "TRPOLoss",

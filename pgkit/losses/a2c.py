@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import dispatch
 from tensordict.utils import NestedKey
 
 from pgkit.functional import policy_gradient
-from pgkit.losses.actor_critic_base import ActorCriticLoss
+from pgkit.losses.policy_base import PolicyLoss
 
 
-class A2CLoss(ActorCriticLoss):
+class A2CLoss(PolicyLoss):
     r"""A2C, a drop-in for TorchRL's loss of that name.
 
     .. math::
@@ -21,7 +21,7 @@ class A2CLoss(ActorCriticLoss):
     Defaults that differ from TorchRL's: squared error for the value (there ``smooth_l1``), entropy coefficient 0
     (there 0.01).
 
-    The arguments are those of :class:`~pgkit.losses.ActorCriticLoss`.
+    The arguments are those of :class:`~pgkit.losses.PolicyLoss`.
 
     Writes ``loss_objective``, ``loss_critic``, ``loss_entropy`` and the metrics ``entropy``, ``explained_variance``.
     """
@@ -29,17 +29,10 @@ class A2CLoss(ActorCriticLoss):
     def _read_keys(self) -> list[NestedKey]:
         return [key for key in super()._read_keys() if key != self.tensor_keys.sample_log_prob]
 
-    def _writes(self) -> list[NestedKey]:
-        return ["loss_objective", *super()._writes()]
-
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Losses and metrics of a batch ``[*B]`` with ``advantage`` ``[*B, 1]``."""
         batch = tensordict.copy()
         advantage, dist = self.get_advantage(batch), self.distribution(batch)
         objective = policy_gradient(self.log_prob(dist, batch).unsqueeze(-1), advantage)
-
-        out = TensorDict({"loss_objective": self.reduce(-objective, batch)})
-        self.add_entropy(out, dist, batch)
-        self.add_critic(out, batch)
-        return out
+        return self.result(batch, objective, dist)

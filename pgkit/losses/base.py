@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.objectives import LossModule
@@ -40,7 +40,7 @@ class Loss(LossModule):
             UserError: it is no TensorDict module.
         """
         for network in module if isinstance(module, list | tuple) else [module]:
-            if not hasattr(network, "in_keys"):
+            if not isinstance(network, TensorDictModuleBase):
                 raise UserError(
                     f"{type(self).__name__} takes TensorDict modules, its {module_name} is a {type(network).__name__}: "
                     "wrap it, tensordict.nn.TensorDictModule(net, in_keys=[...], out_keys=[...])"

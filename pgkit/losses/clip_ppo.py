@@ -5,20 +5,21 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import ClassVar
 
-from tensordict import TensorDict, TensorDictBase
+import torch
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
+from typing_extensions import Unpack
 
 from pgkit.errors import within
 from pgkit.functional import approx_kl, clip_surrogate, same_shape
-from pgkit.functional.values import Distance
-from pgkit.losses.actor_critic_base import ActorCriticLoss
+from pgkit.losses.policy_base import PolicyLoss, PolicySettings
 
 Surrogate = Callable[[Tensor, Tensor], Tensor]
 
 
-class ClipPPOLoss(ActorCriticLoss):
+class ClipPPOLoss(PolicyLoss):
     r"""Clipped PPO, a drop-in for TorchRL's loss of that name.
 
     .. math::
@@ -36,18 +37,19 @@ class ClipPPOLoss(ActorCriticLoss):
         surrogate: replaces the clipped surrogate: ``(log_ratio, advantage) -> objective``, unreduced, to be
             maximized, all ``[*B, 1]``.
         clip_value: clip the value's change to this distance from ``state_value``; True takes ``clip_epsilon``.
-        entropy_coeff, critic_coeff, loss_critic_type, normalize_advantage, entropy_bonus, samples_mc_entropy,
-            separate_losses, reduction: as in :class:`~pgkit.losses.ActorCriticLoss`.
+        settings: those of :class:`~pgkit.losses.PolicyLoss`; ``normalize_advantage`` is True by default.
 
     Writes ``loss_objective``, ``loss_critic``, ``loss_entropy`` and the metrics ``entropy``, ``approx_kl``,
     ``clip_fraction``, ``explained_variance``.
     """
 
-    _schedulable_buffers: ClassVar[frozenset[str]] = frozenset(
-        {"clip_epsilon", "clip_epsilon_low", "clip_epsilon_high", "entropy_coeff", "critic_coeff", "clip_value"}
-    )
+    _schedulable_buffers: ClassVar[frozenset[str]] = PolicyLoss._schedulable_buffers | {
+        "clip_epsilon",
+        "clip_epsilon_low",
+        "clip_epsilon_high",
+    }
 
-    clip_epsilon: Tensor
+    clip_epsilon: Tensor | None
     clip_epsilon_low: Tensor
     clip_epsilon_high: Tensor
 
@@ -58,43 +60,33 @@ class ClipPPOLoss(ActorCriticLoss):
         *,
         clip_epsilon: float | tuple[float, float] = 0.2,
         surrogate: Surrogate | None = None,
-        entropy_coeff: float = 0.0,
-        critic_coeff: float | None = 1.0,
-        loss_critic_type: str | Distance = "l2",
-        normalize_advantage: bool = True,
-        clip_value: bool | float | None = None,
-        entropy_bonus: bool = True,
-        samples_mc_entropy: int = 1,
-        separate_losses: bool = False,
-        reduction: str | None = None,
+        **settings: Unpack[PolicySettings],
     ) -> None:
-        pair = isinstance(clip_epsilon, tuple | list)
-        low, high = clip_epsilon if pair else (clip_epsilon, clip_epsilon)
+        low, high = clip_epsilon if isinstance(clip_epsilon, tuple | list) else (clip_epsilon, clip_epsilon)
         within(0, float("inf"), clip_epsilon=low)
         within(0, float("inf"), clip_epsilon=high)
-        if clip_value is True and low != high:
+        if settings.get("clip_value") is True and low != high:
             raise ValueError(
                 "clip_value=True takes clip_epsilon's value, which is a pair here: give clip_value a number"
             )
-        super().__init__(
-            actor_network, critic_network, entropy_coeff=entropy_coeff, critic_coeff=critic_coeff,
-            loss_critic_type=loss_critic_type, normalize_advantage=normalize_advantage,
-            clip_value=low if clip_value is True else clip_value or None, entropy_bonus=entropy_bonus,
-            samples_mc_entropy=samples_mc_entropy, separate_losses=separate_losses, reduction=reduction,
-        )  # fmt: skip
-        self._clip_names = ("clip_epsilon_low", "clip_epsilon_high") if pair else ("clip_epsilon", "clip_epsilon")
-        for name, value in zip(self._clip_names[: 1 + pair], (low, high), strict=False):
-            self.register_coeff_buffer(name, value)
+        clip_value = settings.get("clip_value")
+        settings["clip_value"] = low if clip_value is True else clip_value or None
+        super().__init__(actor_network, critic_network, **(PolicySettings(normalize_advantage=True) | settings))
+        one = not isinstance(clip_epsilon, tuple | list)
+        self.register_coeff_buffer("clip_epsilon", low if one else None, dtype=torch.float64)
+        self.register_coeff_buffer("clip_epsilon_low", None if one else low, dtype=torch.float64)
+        self.register_coeff_buffer("clip_epsilon_high", None if one else high, dtype=torch.float64)
         self.surrogate = surrogate
 
     @property
     def clip_bounds(self) -> tuple[Tensor, Tensor]:
         """How far the ratio may fall below 1 and rise above it."""
-        low, high = self._clip_names
-        return getattr(self, low), getattr(self, high)
+        if self.clip_epsilon is None:
+            return self.clip_epsilon_low, self.clip_epsilon_high
+        return self.clip_epsilon, self.clip_epsilon
 
     def _writes(self) -> list[NestedKey]:
-        return ["loss_objective", *super()._writes(), "approx_kl", "clip_fraction"]
+        return [*super()._writes(), "approx_kl", "clip_fraction"]
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -108,10 +100,7 @@ class ClipPPOLoss(ActorCriticLoss):
             objective = self.surrogate(log_ratio, advantage)
         same_shape(advantage=advantage, surrogate=objective)
 
-        out = TensorDict({"loss_objective": self.reduce(-objective, batch)})
-        self.add_entropy(out, dist, batch)
-        self.add_critic(out, batch)
-
+        out = self.result(batch, objective, dist)
         ratio = log_ratio.detach().exp()
         out["approx_kl"] = self.average(approx_kl(log_ratio), batch)
         out["clip_fraction"] = self.average(((ratio < 1 - low) | (ratio > 1 + high)).to(ratio.dtype), batch)

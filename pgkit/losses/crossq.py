@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, dispatch
 from torch import nn
+from typing_extensions import Unpack
 
-from pgkit.functional import same_shape, soft_returns
-from pgkit.losses.soft_base import SoftQLoss
+from pgkit.functional import same_shape
+from pgkit.losses.q_base import Critics
+from pgkit.losses.soft_base import SoftQLoss, SoftSettings
 
 
 class CrossQLoss(SoftQLoss):
@@ -40,10 +41,7 @@ class CrossQLoss(SoftQLoss):
     """
 
     def __init__(
-        self,
-        actor_network: TensorDictModule,
-        qvalue_network: TensorDictModule | Sequence[TensorDictModule],
-        **settings: Any,
+        self, actor_network: TensorDictModule, qvalue_network: Critics, **settings: Unpack[SoftSettings]
     ) -> None:
         super().__init__(actor_network, qvalue_network, delay_actor=False, delay_qvalue=False, **settings)
 
@@ -56,22 +54,22 @@ class CrossQLoss(SoftQLoss):
             next_action, next_log_prob = self.act(batch["next"], self.actor_network_params)
         keys = [key for key in self.qvalue_network.in_keys if key != self.tensor_keys.action]
         both = torch.cat([batch.select(*keys), batch["next"].select(*keys)])
-        action = torch.cat([batch[self.tensor_keys.action], next_action])
-        returns, next_returns = self.returns(both, action, self.qvalue_network_params).chunk(2)
+        both_actions = torch.cat([batch[self.tensor_keys.action], next_action])
+        outputs, next_outputs = self.outputs(both, both_actions, self.qvalue_network_params).chunk(2)
 
         with torch.no_grad():
-            subset = self.draw()
-            atoms, weights = self.head.pool(next_returns if subset is None else next_returns[..., subset, :])
-            atoms = self.target(batch, soft_returns(atoms, next_log_prob, alpha))
-        qvalue_loss = self.head.loss(returns, atoms, weights).sum(-1) * self.weight(batch)
-        q = self.head.mean(returns)
-        self.write_priority(batch, q - (atoms * weights).sum(-1, keepdim=True))
+            members = self.draw()
+            min_q = self.head.least(next_outputs if members is None else next_outputs[..., members, :])
+            target = self.target(batch, min_q - alpha * next_log_prob)
+        loss_qvalue, q = self.regress(batch, outputs, target)
 
+        batch = self.first(batch)
         action, log_prob = self.act(batch, self.actor_network_params)
         with _running_statistics(self.qvalue_network):
             value = self.actor_value(self.q(batch, action, self.qvalue_network_params.detach()))
         same_shape(log_prob=log_prob, value=value)
-        return self.result(batch, alpha * log_prob - value, qvalue_loss, action, log_prob, q)
+        loss_actor = self.reduce(alpha * log_prob - value, batch)
+        return self.result(batch, loss_actor, loss_qvalue, action, log_prob, q)
 
 
 @contextmanager

@@ -8,10 +8,11 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, dispatch
 from tensordict.utils import NestedKey
+from typing_extensions import Unpack
 
 from pgkit.errors import UserError
-from pgkit.heads import Head
-from pgkit.losses.q_base import QLoss, refuse_stochastic
+from pgkit.losses.actors import refuse_stochastic
+from pgkit.losses.q_base import QLoss, QSettings
 
 
 class DDPGLoss(QLoss):
@@ -33,7 +34,8 @@ class DDPGLoss(QLoss):
         value_network: one critic, ``state_action_value [*B, 1]``, e.g. ``pgkit.modules.q_value(env, num_critics=1)``.
         loss_function: distance of a scalar critic: ``l2``, ``l1`` or ``smooth_l1``.
         delay_actor, delay_value: use a delayed actor, a delayed critic in the target.
-        gamma, separate_losses, reduction, head: as in :class:`~pgkit.losses.QLoss`.
+        settings: ``gamma``, ``separate_losses``, ``augmented``, ``reduction`` and ``head`` of
+            :class:`~pgkit.losses.QLoss`.
 
     Writes ``loss_actor``, ``loss_value`` and, as numbers, the metrics ``pred_value``, ``target_value`` (means),
     ``pred_value_max``, ``target_value_max``; and ``td_error [*B]`` into the batch, a prioritized replay's priority.
@@ -48,22 +50,24 @@ class DDPGLoss(QLoss):
         value_network: TensorDictModule,
         *,
         loss_function: str = "l2",
-        gamma: float = 0.99,
         delay_actor: bool = True,
         delay_value: bool = True,
-        separate_losses: bool = False,
-        reduction: str | None = None,
-        head: Head | None = None,
+        **settings: Unpack[QSettings],
     ) -> None:
-        refuse_stochastic("DDPGLoss", actor_network)
-        several = len(value_network) if isinstance(value_network, list | tuple) else 1
-        critics = getattr(value_network, "num_critics", several)
-        if critics != 1:
-            raise UserError(f"DDPGLoss has one critic, these are {critics}: num_critics=1, or losses.TD3Loss for two")
         super().__init__(
-            actor_network, value_network, num_qvalue_nets=1, gamma=gamma, delay_actor=delay_actor,
-            delay_qvalue=delay_value, separate_losses=separate_losses, reduction=reduction, head=head,
-        )  # fmt: skip
+            actor_network,
+            value_network,
+            num_qvalue_nets=1,
+            delay_actor=delay_actor,
+            delay_qvalue=delay_value,
+            **settings,
+        )
+        refuse_stochastic("DDPGLoss", actor_network)
+        if self.num_critics != 1:
+            raise UserError(
+                f"DDPGLoss has one critic, these are {self.num_critics}: num_critics=1, or losses.TD3Loss for two"
+            )
+        self.delay_value = delay_value
         self.set_distance(loss_function)
 
     @property
@@ -86,24 +90,18 @@ class DDPGLoss(QLoss):
 
         with torch.no_grad():
             next_action = self.action(batch["next"], self.target_actor_network_params)
-            next_returns = self.returns(batch["next"], next_action, self.target_qvalue_network_params)
-            atoms, weights = self.head.pool(next_returns)
-            atoms = self.target(batch, atoms)
+            next_outputs = self.outputs(batch["next"], next_action, self.target_qvalue_network_params)
+            target = self.target(batch, self.head.returns(next_outputs.squeeze(-2)))
 
-        returns = self.returns(batch, batch[self.tensor_keys.action], self.qvalue_network_params)
-        critic_loss = self.head.loss(returns, atoms, weights).squeeze(-1) * self.weight(batch)
-        q, target = self.head.mean(returns), (atoms * weights).sum(-1, keepdim=True)
-        self.write_priority(batch, q - target)
+        outputs = self.outputs(batch, batch[self.tensor_keys.action], self.qvalue_network_params)
+        loss_value, q = self.regress(batch, outputs, target)
 
+        batch = self.first(batch)
         action = self.action(batch, self.actor_network_params)
         value = self.q(batch, action, self.qvalue_network_params.detach()).squeeze(-1)
 
-        out = TensorDict(
-            {
-                "loss_actor": self.reduce(-value, batch),
-                "loss_value": self.reduce(critic_loss, batch),
-            }
-        )
-        out["pred_value"], out["pred_value_max"] = q.detach().mean(), q.detach().max()
-        out["target_value"], out["target_value_max"] = target.mean(), target.max()
+        out = TensorDict({"loss_actor": self.reduce(-value, batch), "loss_value": loss_value})
+        q, y = q.detach(), target.mean
+        out["pred_value"], out["pred_value_max"] = q.mean(), q.max()
+        out["target_value"], out["target_value_max"] = y.mean(), y.max()
         return out

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from math import log
 from typing import Any, Literal
@@ -12,12 +11,14 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data import Composite, TensorSpec
+from torchrl.data import TensorSpec
+from typing_extensions import Unpack
 
 from pgkit.errors import UserError
-from pgkit.functional import expected_soft_value, straight_through_sample, twin_minimum, value_loss
-from pgkit.heads import Scalar
-from pgkit.losses.soft_base import SoftQLoss
+from pgkit.functional import expected_soft_value, straight_through_sample, twin_minimum
+from pgkit.heads import Returns, Scalar
+from pgkit.losses.q_base import Critics, Members
+from pgkit.losses.soft_base import SoftQLoss, SoftSettings
 
 
 class DiscreteSACLoss(SoftQLoss):
@@ -50,8 +51,7 @@ class DiscreteSACLoss(SoftQLoss):
             :math:`\bar H \log(\text{allowed}) / \log(\text{actions})`.
         form: ``expectation`` or ``gumbel_softmax``.
         relaxation: temperature of the relaxation, for ``gumbel_softmax``.
-        loss_function: ``l2``, ``l1`` or ``smooth_l1``.
-        settings: the other settings of :class:`~pgkit.losses.SoftQLoss`.
+        settings: those of :class:`~pgkit.losses.SoftQLoss`.
 
     Writes what :class:`~pgkit.losses.SACLoss` writes.
     """
@@ -69,32 +69,31 @@ class DiscreteSACLoss(SoftQLoss):
     def __init__(
         self,
         actor_network: TensorDictModule,
-        qvalue_network: TensorDictModule | Sequence[TensorDictModule],
+        qvalue_network: Critics,
         *,
         action_space: str | TensorSpec | None = None,
         num_actions: int | None = None,
-        action_spec: TensorSpec | None = None,
         target_entropy_weight: float = 0.98,
-        target_entropy: str | float = "auto",
         form: Literal["expectation", "gumbel_softmax"] = "expectation",
         relaxation: float = 1.0,
-        loss_function: str = "l2",
-        **settings: Any,
+        **settings: Unpack[SoftSettings],
     ) -> None:
-        if isinstance(action_spec, Composite):
-            action_spec = action_spec[actor_network.dist_sample_keys[0]]
-        num_actions = getattr(getattr(action_spec, "space", None), "n", None) if num_actions is None else num_actions
-        if target_entropy == "auto" and num_actions is not None:
-            target_entropy = target_entropy_weight * log(num_actions)
-        super().__init__(
-            actor_network, qvalue_network, target_entropy=target_entropy, loss_function=loss_function, **settings
-        )
-        if self.head != Scalar(loss_function):
+        self.num_actions, self.target_entropy_weight = num_actions, target_entropy_weight
+        super().__init__(actor_network, qvalue_network, **settings)
+        if not isinstance(self.head, Scalar):
             raise UserError(f"DiscreteSACLoss learns expected values: it has no use for head={self.head}")
         if form not in ("expectation", "gumbel_softmax"):
             raise ValueError(f"form is 'expectation' or 'gumbel_softmax', not {form!r}")
-        self.form, self.relaxation, self.loss_function = form, relaxation, loss_function
-        self.target_entropy_weight = target_entropy_weight
+        self.form, self.relaxation = form, relaxation
+
+    def automatic_entropy(self, spec: Any) -> float | None:
+        """The target entropy that ``auto`` means: a share of the largest; None if the number of actions is unknown."""
+        actions = self.num_actions or (None if spec is None else spec.space.n)
+        return None if actions is None else self.target_entropy_weight * log(actions)
+
+    def seen_entropy(self, action: Any, log_prob: Tensor) -> float:
+        """The same, read off the weights of the actions ``[*B, actions]``."""
+        return self.target_entropy_weight * log(action.shape[-1])
 
     def policy(self, batch: TensorDictBase, params: Any) -> tuple[Tensor, Tensor]:
         """Weights ``w`` and log-probabilities of all actions at the batch's observations, ``[*B, actions]`` each."""
@@ -105,17 +104,10 @@ class DiscreteSACLoss(SoftQLoss):
             return log_prob.exp(), log_prob
         return straight_through_sample(log_prob, self.relaxation), log_prob
 
-    def action_values(self, batch: TensorDictBase, params: Any, members: Tensor | slice | None = None) -> Tensor:
+    def action_values(self, batch: TensorDictBase, params: Any, members: Members = None) -> Tensor:
         """The values ``[*B, critics, actions]`` at the batch's observations, of the critics ``members`` or of all."""
-        data, key = batch.select(*self.qvalue_network.in_keys), self.tensor_keys.action_value
-        params, members = self.params_of(params, members)
-        if self._each is not None:
-            out = self._each(data, params).get(key)
-            return (out if out.dim() == data.dim() + 2 else out.squeeze(-2)).movedim(0, -2)
-        with params.to_module(self.qvalue_network, preserve_module_state=False):
-            q = self.qvalue_network(data).get(key)
-        q = q if q.dim() > data.dim() + 1 else q.unsqueeze(-2)
-        return q if members is None else q[..., members, :]
+        data = batch.select(*self.qvalue_network.in_keys)
+        return self.evaluate(data, self.tensor_keys.action_value, params, members)
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -123,27 +115,25 @@ class DiscreteSACLoss(SoftQLoss):
         batch, alpha = tensordict, self.alpha
 
         with torch.no_grad():
-            next_weights, next_log_prob = self.policy(batch["next"], self.target_actor_network_params)
+            weights, log_prob = self.policy(batch["next"], self.target_actor_network_params)
             next_q = self.action_values(batch["next"], self.target_qvalue_network_params, self.draw())
-            next_value = twin_minimum(next_q.mT)
-            target = self.target(batch, expected_soft_value(next_weights, next_log_prob, next_value, alpha))
+            next_value = expected_soft_value(weights, log_prob, twin_minimum(next_q.mT), alpha)
+            target = self.target(batch, Returns.certain(next_value))
 
         q_all = self.action_values(batch, self.qvalue_network_params)
-        q = _chosen(q_all, batch[self.tensor_keys.action])
-        target = target.unsqueeze(-1).expand_as(q)
-        qvalue_loss = value_loss(q, target, self.loss_function).sum(-1) * self.weight(batch)
-        self.write_priority(batch, q - target)
+        chosen = _chosen(q_all, batch[self.tensor_keys.action])
+        loss_qvalue, q = self.regress(batch, chosen.unsqueeze(-1), target)
 
+        batch, q_all = self.first(batch), self.first(q_all.detach())
         weights, log_prob = self.policy(batch, self.actor_network_params)
-        actor_loss = -expected_soft_value(weights, log_prob, self.actor_value(q_all.detach().mT), alpha)
-        if self._target_entropy is None:
-            self._target_entropy = self.target_entropy_weight * log(log_prob.shape[-1])
-        entropy = -(weights * log_prob).sum(-1)
-        return self.result(batch, actor_loss, qvalue_loss, weights, -entropy, q, self.out_of_reach(log_prob))
+        value = expected_soft_value(weights, log_prob, self.actor_value(q_all.mT), alpha)
+        loss_actor, expected = self.reduce(-value, batch), (weights * log_prob).sum(-1)
+        return self.result(batch, loss_actor, loss_qvalue, weights, expected, q, self.out_of_reach(log_prob))
 
     def out_of_reach(self, log_prob: Tensor) -> Tensor | float:
         """What an action mask takes off the target entropy, ``[*B]``; ``log_prob [*B, actions]``."""
-        target = self._target_entropy if self.temperature is None else getattr(self.temperature, "target_entropy", None)
+        known = getattr(self.temperature, "target_entropy", None)
+        target = self.seen_entropy(log_prob, log_prob) if self._automatic else known
         if target is None or "action_mask" not in self.actor_network.in_keys:
             return 0.0
         allowed = (log_prob.detach() > -1e5).sum(-1)

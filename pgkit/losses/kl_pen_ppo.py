@@ -5,17 +5,17 @@ from __future__ import annotations
 from typing import ClassVar
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
+from typing_extensions import Unpack
 
 from pgkit.functional import adapted_coefficient, approx_kl, ratio_surrogate
-from pgkit.functional.values import Distance
-from pgkit.losses.actor_critic_base import ActorCriticLoss
+from pgkit.losses.policy_base import PolicyLoss, PolicySettings
 
 
-class KLPENPPOLoss(ActorCriticLoss):
+class KLPENPPOLoss(PolicyLoss):
     r"""PPO with a KL penalty, a drop-in for TorchRL's loss of that name.
 
     .. math::
@@ -39,14 +39,13 @@ class KLPENPPOLoss(ActorCriticLoss):
         beta: :math:`\beta` at the start.
         increment: factor of :math:`\beta` when the KL is above 1.5 times ``dtarg``.
         decrement: factor of :math:`\beta` when the KL is below ``dtarg`` / 1.5.
-        entropy_coeff, critic_coeff, loss_critic_type, normalize_advantage, clip_value, entropy_bonus, separate_losses,
-            reduction: as in :class:`~pgkit.losses.ActorCriticLoss`.
+        settings: those of :class:`~pgkit.losses.PolicyLoss`; ``normalize_advantage`` is True by default.
 
     Writes ``loss_objective``, ``loss_critic``, ``loss_entropy`` and the metrics ``entropy``, ``kl``, ``kl_approx``
     (the estimate from the batch's actions), ``beta``, ``explained_variance``.
     """
 
-    _schedulable_buffers: ClassVar[frozenset[str]] = ActorCriticLoss._schedulable_buffers | {"beta"}
+    _schedulable_buffers: ClassVar[frozenset[str]] = PolicyLoss._schedulable_buffers | {"beta"}
 
     beta: Tensor
 
@@ -60,30 +59,19 @@ class KLPENPPOLoss(ActorCriticLoss):
         beta: float = 1.0,
         increment: float = 2.0,
         decrement: float = 0.5,
-        entropy_coeff: float = 0.0,
-        critic_coeff: float | None = 1.0,
-        loss_critic_type: str | Distance = "l2",
-        normalize_advantage: bool = True,
-        clip_value: float | None = None,
-        entropy_bonus: bool = True,
-        separate_losses: bool = False,
-        reduction: str | None = None,
+        **settings: Unpack[PolicySettings],
     ) -> None:
-        super().__init__(
-            actor_network, critic_network, entropy_coeff=entropy_coeff, critic_coeff=critic_coeff,
-            loss_critic_type=loss_critic_type, normalize_advantage=normalize_advantage, clip_value=clip_value,
-            entropy_bonus=entropy_bonus, separate_losses=separate_losses, reduction=reduction,
-        )  # fmt: skip
+        super().__init__(actor_network, critic_network, **(PolicySettings(normalize_advantage=True) | settings))
         self.controller = controller
         self.dtarg, self.increment, self.decrement = dtarg, increment, decrement
         if controller is None:
-            self.register_coeff_buffer("beta", beta)
+            self.register_coeff_buffer("beta", beta, dtype=torch.float32)  # a compiled step loses writes to a float64
 
     def _read_keys(self) -> list[NestedKey]:
         return [*super()._read_keys(), *self.distribution_keys]
 
     def _writes(self) -> list[NestedKey]:
-        return ["loss_objective", *super()._writes(), "kl", "kl_approx", "beta"]
+        return [*super()._writes(), "kl", "kl_approx", "beta"]
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -95,9 +83,7 @@ class KLPENPPOLoss(ActorCriticLoss):
         log_ratio = self.log_ratio(dist, batch)
         objective = ratio_surrogate(log_ratio, advantage) - beta * kl
 
-        out = TensorDict({"loss_objective": self.reduce(-objective, batch)})
-        self.add_entropy(out, dist, batch)
-        self.add_critic(out, batch)
+        out = self.result(batch, objective, dist)
         out["kl"], out["beta"] = self.average(kl, batch), beta
         out["kl_approx"] = self.average(approx_kl(log_ratio), batch)
         if self.controller is None:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, ClassVar, TypedDict
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import CompositeDistribution, TensorDictModule, set_composite_lp_aggregate
 from tensordict.utils import NestedKey
 from torch import Tensor
@@ -14,20 +14,51 @@ from torch.distributions import Distribution, kl_divergence
 from torchrl.modules.distributions.utils import sample_and_log_prob
 from torchrl.objectives.utils import ValueEstimators, dispatch_value_estimator
 
-from pgkit.errors import UserError
-from pgkit.functional import approx_kl, listed, same_shape
+from pgkit.functional import (
+    approx_kl,
+    clipped_value_loss,
+    explained_variance,
+    listed,
+    same_shape,
+    standardize,
+    value_loss,
+)
+from pgkit.functional.values import Distance
+from pgkit.losses.actors import need_distribution
 from pgkit.losses.base import Loss
 
 
+class PolicySettings(TypedDict, total=False):
+    """Keywords of :class:`PolicyLoss`, which says what they mean and what they default to."""
+
+    entropy_coeff: float
+    critic_coeff: float | None
+    loss_critic_type: str | Distance
+    normalize_advantage: bool
+    clip_value: bool | float | None
+    entropy_bonus: bool
+    samples_mc_entropy: int
+    separate_losses: bool
+    reduction: str | None
+
+
 class PolicyLoss(Loss):
-    """Base of the losses of an actor and a state-value critic on on-policy data.
+    """Base of the losses of an actor and a state-value critic on on-policy data, with TorchRL's settings.
 
     It holds both networks as TorchRL losses do (``actor_network``, ``actor_network_params``, ...), names the keys,
-    and gives subclasses verbs: :meth:`distribution`, :meth:`log_prob`, :meth:`log_ratio`, :meth:`kl`, :meth:`value`.
+    and gives subclasses verbs: :meth:`distribution`, :meth:`log_prob`, :meth:`log_ratio`, :meth:`kl`, :meth:`value`;
+    and :meth:`result`, or its parts :meth:`add_entropy` and :meth:`add_critic`.
 
     Args:
         actor_network: probabilistic actor.
-        critic_network: value operator; None for losses without one.
+        critic_network: value operator; None leaves the value loss out.
+        entropy_coeff: weight of the entropy bonus.
+        critic_coeff: weight of the value loss; None or 0 leaves it out.
+        loss_critic_type: ``l2``, ``l1``, ``smooth_l1``, or a function ``(value, target) -> loss``, unreduced.
+        normalize_advantage: zero mean and unit deviation within the minibatch.
+        clip_value: clip the value's change to this distance from ``state_value``.
+        entropy_bonus: False leaves entropy out altogether.
+        samples_mc_entropy: draws that estimate the entropy of a distribution without a closed form.
         separate_losses: parameters that both networks share are trained by the policy's loss only.
         reduction: ``mean``, ``sum`` or ``none``.
     """
@@ -47,7 +78,10 @@ class PolicyLoss(Loss):
 
     default_keys = _AcceptedKeys
     default_value_estimator = ValueEstimators.GAE
-    samples_mc_entropy: int = 1
+    _schedulable_buffers: ClassVar[frozenset[str]] = frozenset({"entropy_coeff", "critic_coeff", "clip_value"})
+    entropy_coeff: Tensor
+    critic_coeff: Tensor
+    clip_value: Tensor | None
     critic_network: TensorDictModule | None
     critic_network_params: Any
     target_critic_network_params: Any
@@ -57,17 +91,20 @@ class PolicyLoss(Loss):
         actor_network: TensorDictModule,
         critic_network: TensorDictModule | None = None,
         *,
+        entropy_coeff: float = 0.0,
+        critic_coeff: float | None = 1.0,
+        loss_critic_type: str | Distance = "l2",
+        normalize_advantage: bool = False,
+        clip_value: float | None = None,
+        entropy_bonus: bool = True,
+        samples_mc_entropy: int = 1,
         separate_losses: bool = False,
         reduction: str | None = None,
     ) -> None:
         super().__init__(reduction)
         self.convert_to_functional(actor_network, "actor_network")
-        if not hasattr(actor_network, "dist_sample_keys"):
-            raise UserError(
-                f"{type(self).__name__} needs an actor that draws from a distribution (modules.gaussian_actor, "
-                "modules.actor), this one gives one action: losses.TD3Loss and losses.DDPGLoss take it"
-            )
-        if critic_network is None:
+        need_distribution(type(self).__name__, actor_network, "modules.gaussian_actor, modules.actor")
+        if critic_network is None or not critic_coeff:
             self.critic_network = None
         else:
             shared = list(actor_network.parameters()) if separate_losses else None
@@ -75,6 +112,14 @@ class PolicyLoss(Loss):
         several = (list(actor_network.dist_sample_keys), list(actor_network.log_prob_keys))
         action, log_prob = (keys[0] if len(keys) == 1 else keys for keys in several)
         self.set_keys(action=action, sample_log_prob=log_prob)
+        for name, value in {
+            "entropy_coeff": entropy_coeff,
+            "critic_coeff": critic_coeff,
+            "clip_value": clip_value,
+        }.items():
+            self.register_coeff_buffer(name, value, dtype=torch.float64)
+        self.loss_critic_type, self.normalize_advantage = loss_critic_type, normalize_advantage
+        self.entropy_bonus, self.samples_mc_entropy = entropy_bonus, samples_mc_entropy
 
     def distribution(self, batch: TensorDictBase) -> Distribution:
         """The policy's distribution at the batch's observations; the batch is left as it is."""
@@ -160,7 +205,10 @@ class PolicyLoss(Loss):
             return -log_prob.mean(0)
 
     def get_advantage(self, batch: TensorDictBase) -> Tensor:
-        """The batch's advantage, computed by this loss's own estimator only if the user made one."""
+        """The batch's advantage ``[*B, 1]``, standardized over the batch if this loss does that.
+
+        This loss's own estimator computes it only if the user made one and the batch has none.
+        """
         if self.tensor_keys.advantage not in batch.keys(True):
             if self._value_estimator is None:
                 raise KeyError(
@@ -172,14 +220,47 @@ class PolicyLoss(Loss):
                 params=self.critic_network_params.detach(),
                 target_params=self.target_critic_network_params,
             )
-        return batch.get(self.tensor_keys.advantage)
+        advantage = batch.get(self.tensor_keys.advantage)
+        return standardize(advantage, self.mask(advantage, batch)) if self.normalize_advantage else advantage
+
+    @staticmethod
+    def mask(entry: Tensor, batch: TensorDictBase) -> Tensor | None:
+        """Which elements of an entry ``[*B, 1]`` are no padding, in its shape; None if the batch has none."""
+        mask = batch.get(("collector", "mask"), None)
+        return None if mask is None else mask.reshape(entry.shape)
+
+    def result(self, batch: TensorDictBase, objective: Tensor, dist: Distribution) -> TensorDict:
+        """Losses and metrics of an unreduced ``objective [*B, 1]``, to be maximized; of entropy and value too."""
+        out = TensorDict({"loss_objective": self.reduce(-objective, batch)})
+        self.add_entropy(out, dist, batch)
+        self.add_critic(out, batch)
+        return out
+
+    def add_entropy(self, out: TensorDict, dist: Distribution, batch: TensorDictBase) -> None:
+        """Writes ``loss_entropy`` and ``entropy``, unless there is no entropy bonus."""
+        if self.entropy_bonus:
+            entropy = self.entropy(dist)
+            out["loss_entropy"] = self.reduce(-self.entropy_coeff * entropy, batch)
+            out["entropy"] = self.average(entropy, batch)
+
+    def add_critic(self, out: TensorDict, batch: TensorDictBase, name: str = "loss_critic") -> None:
+        """Writes the value loss as ``name``, and ``explained_variance``, unless there is no critic."""
+        if self.critic_network is None:
+            return
+        value, target = self.value(batch), batch[self.tensor_keys.value_target]
+        if self.clip_value is None:
+            error = value_loss(value, target, self.loss_critic_type)
+        else:
+            old_value = batch[self.tensor_keys.value]
+            error = clipped_value_loss(value, target, old_value, self.clip_value, self.loss_critic_type)
+        out[name] = self.reduce(self.critic_coeff * error, batch)
+        out["explained_variance"] = explained_variance(value.detach(), target, self.mask(target, batch))
 
     def make_value_estimator(self, value_type: ValueEstimators | None = None, **hyperparams: Any) -> PolicyLoss:
         """As in TorchRL; returns the loss."""
         value_type, hp = self._prepare_value_estimator_kwargs(value_type, **hyperparams)
         if value_type is not None:
-            names = ("advantage", "value", "value_target", "reward", "done", "terminated", "sample_log_prob")
-            keys = {name: getattr(self.tensor_keys, name) for name in names}
+            keys = {name: key for name, key in vars(self.tensor_keys).items() if name != "action"}
             supported = {value_type: value_type.name}
             dispatch_value_estimator(self, value_type, supported=supported, tensor_keys=keys, **hp)
         self._in_keys = None
@@ -197,6 +278,11 @@ class PolicyLoss(Loss):
         after = [*self.critic_network.in_keys, keys.reward, keys.done, keys.terminated]
         return [("next", *((key,) if isinstance(key, str) else key)) for key in after]
 
+    def _writes(self) -> list[NestedKey]:
+        entropy = ["loss_entropy", "entropy"] if self.entropy_bonus else []
+        critic = [] if self.critic_network is None else ["loss_critic", "explained_variance"]
+        return ["loss_objective", *entropy, *critic]
+
     def _read_keys(self) -> list[NestedKey]:
         """Entries that ``forward`` reads besides the networks' inputs."""
         keys = self.tensor_keys
@@ -207,3 +293,6 @@ class PolicyLoss(Loss):
         if self._value_estimator is not None:
             accepted = {field.name for field in fields(self._value_estimator._AcceptedKeys)}
             self._value_estimator.set_keys(**{k: v for k, v in kwargs.items() if k in accepted})
+
+
+ActorCriticLoss = PolicyLoss  # its name while the settings of entropy and value had a class of their own

@@ -4,21 +4,37 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypedDict
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.modules import Delta, TanhDelta
-from torchrl.modules.distributions.utils import rsample_and_log_prob
+from torchrl.objectives.sac import compute_rsample_log_prob
 from torchrl.objectives.utils import ValueEstimators, _vmap_func
 
 from pgkit.errors import UserError, within
 from pgkit.functional import bootstrap_target
-from pgkit.heads import Head, Scalar
+from pgkit.heads import Head, Returns, Scalar
+from pgkit.losses.actors import PROBABILISTIC
 from pgkit.losses.base import Loss
+
+Critics = TensorDictModule | Sequence[TensorDictModule]
+Members = Tensor | slice | None
+
+
+class QSettings(TypedDict, total=False):
+    """Keywords of :class:`QLoss`, which says what they mean and what they default to."""
+
+    num_qvalue_nets: int
+    gamma: float
+    delay_actor: bool
+    delay_qvalue: bool
+    separate_losses: bool
+    augmented: bool
+    reduction: str | None
+    head: Head | None
 
 
 class QLoss(Loss):
@@ -26,7 +42,7 @@ class QLoss(Loss):
 
     It holds the networks as TorchRL does (``qvalue_network_params``, ``target_qvalue_network_params``, ...), owns the
     discount, names the keys, and gives subclasses these verbs: :meth:`act` (for a deterministic actor :meth:`action`),
-    :meth:`q`, :meth:`target`, :meth:`write_priority`.
+    :meth:`min_q`, :meth:`target`, :meth:`outputs`, :meth:`regress`, :meth:`q`.
 
     Args:
         actor_network: probabilistic actor, or a deterministic one.
@@ -39,6 +55,9 @@ class QLoss(Loss):
         delay_actor: use a delayed actor in the target.
         delay_qvalue: use delayed critics in the target.
         separate_losses: parameters that both networks share are trained by the policy's loss only.
+        augmented: a batch is ``[copies, *B]``, copies of the same transitions that an augmentation changed: their
+            targets and the critics' losses are averaged, the actor learns on the first copy (DrQ, Yarats et al., 2021,
+            https://arxiv.org/abs/2004.13649).
         reduction: ``mean``, ``sum`` or ``none``.
         head: what the critics' outputs stand for, one of :mod:`pgkit.heads`; None: the network's own, or else a scalar.
     """
@@ -67,43 +86,38 @@ class QLoss(Loss):
     def __init__(
         self,
         actor_network: TensorDictModule,
-        qvalue_network: TensorDictModule | Sequence[TensorDictModule],
+        qvalue_network: Critics,
         *,
         num_qvalue_nets: int = 2,
         gamma: float = 0.99,
         delay_actor: bool = False,
         delay_qvalue: bool = True,
         separate_losses: bool = False,
+        augmented: bool = False,
         reduction: str | None = None,
         head: Head | None = None,
     ) -> None:
         super().__init__(reduction)
         within(0, 1, gamma=gamma)
-        self.register_coeff_buffer("gamma", gamma)
-        self.delay_actor, self.delay_qvalue = delay_actor, delay_qvalue
+        self.register_coeff_buffer("gamma", gamma, dtype=torch.float64)
+        self.delay_actor, self.delay_qvalue, self.augmented = delay_actor, delay_qvalue, augmented
         self.convert_to_functional(actor_network, "actor_network", create_target_params=delay_actor)
-        several = isinstance(qvalue_network, Sequence) and not isinstance(qvalue_network, torch.nn.Module)
-        networks = list(qvalue_network) if several else [qvalue_network]
-        alone = len(networks) == 1 and (several or num_qvalue_nets == 1 or hasattr(networks[0], "num_critics"))
-        number = len(networks) if several else num_qvalue_nets
-        self.num_critics = getattr(networks[0], "num_critics", 1) if alone else number
-        own = getattr(networks[0], "head", None)
-        self.head = head or (own if isinstance(own, Head) else Scalar())
+        networks, self.num_critics, self._together = _arranged(qvalue_network, num_qvalue_nets)
+        self.head = head or head_of(networks[0]) or Scalar()
         self.convert_to_functional(
             networks if len(networks) > 1 else networks[0],
             "qvalue_network",
-            None if alone else number,
+            None if self._together else self.num_critics,
             create_target_params=delay_qvalue,
             compare_against=list(actor_network.parameters()) if separate_losses else None,
         )
-        self._alone = alone
         self._make_vmap()
-        if hasattr(actor_network, "dist_sample_keys"):
+        if isinstance(actor_network, PROBABILISTIC):
             self.set_keys(action=actor_network.dist_sample_keys[0], log_prob=actor_network.log_prob_keys[0])
 
     def _make_vmap(self) -> None:  # TorchRL's hook: again after set_vmap_randomness
-        of_each = None if self._alone else _vmap_func(self.qvalue_network, (None, 0), randomness=self.vmap_randomness)
-        self._each = of_each
+        if not self._together:
+            self._each = _vmap_func(self.qvalue_network, (None, 0), randomness=self.vmap_randomness)
 
     def set_distance(self, loss_function: str) -> None:
         """The distance of scalar critics that have no head of their own: ``l2``, ``l1`` or ``smooth_l1``."""
@@ -112,11 +126,11 @@ class QLoss(Loss):
         elif loss_function != "l2":
             raise UserError(f"loss_function={loss_function!r} is for critics without a head, these have {self.head}")
 
-    def act(self, batch: TensorDictBase, params: Any) -> tuple[Tensor, Tensor]:
+    def act(self, batch: TensorDictBase, params: Any) -> tuple[Any, Tensor]:
         """An action drawn from the policy at the batch's observations, and its log-probability ``[*B]``: one draw."""
         with params.to_module(self.actor_network, preserve_module_state=False):
-            dist = self.actor_network.get_dist(batch.select(*self.actor_network.in_keys))
-        return rsample_and_log_prob(dist)
+            dist = self.actor_network.get_dist(batch.select(*self.actor_network.in_keys, strict=False))
+        return compute_rsample_log_prob(dist)
 
     def action(self, batch: TensorDictBase, params: Any) -> Tensor:
         """A deterministic actor's action ``[*B, actions]`` at the batch's observations."""
@@ -124,9 +138,7 @@ class QLoss(Loss):
             out = self.actor_network(batch.select(*self.actor_network.in_keys))
         return out.get(self.tensor_keys.action)
 
-    def returns(
-        self, batch: TensorDictBase, action: Tensor, params: Any, members: Tensor | slice | None = None
-    ) -> Tensor:
+    def outputs(self, batch: TensorDictBase, action: Any, params: Any, members: Members = None) -> Tensor:
         """What the head reads, ``[*B, critics, size]``, for ``action`` at the batch's observations.
 
         ``members`` names the critics to evaluate, in the order of the result; None: all.
@@ -135,63 +147,84 @@ class QLoss(Loss):
             UserError: the critics' outputs are not those of this number of critics or not those of the head.
         """
         data = batch.select(*self.qvalue_network.in_keys, strict=False).set(self.tensor_keys.action, action)
-        number = self.num_critics if members is None else None
-        params, members = self.params_of(params, members)
-        if self.tensor_keys.state_action_value not in self.qvalue_network.out_keys:
+        out = self.evaluate(data, self.tensor_keys.state_action_value, params, members)
+        if (out.shape[-1] > 1) != (self.head.size > 1) or (members is None and out.shape[-2] != self.num_critics):
+            raise UserError(self._other_outputs(out))
+        return out
+
+    def evaluate(self, data: TensorDictBase, key: NestedKey, params: Any, members: Members = None) -> Tensor:
+        """The critics' entry ``key`` as ``[*B, critics, size]``, whether one network writes it or each its own."""
+        if key not in self.qvalue_network.out_keys:
             raise UserError(
-                f"{type(self).__name__} reads '{self.tensor_keys.state_action_value}' of its critics, they write "
+                f"{type(self).__name__} reads '{key}' of its critics, they write "
                 f"{', '.join(map(str, self.qvalue_network.out_keys))}: give modules.q_value(env), or set_keys(...)"
             )
-        if self._each is not None:
-            out = self._each(data, params).get(self.tensor_keys.state_action_value)
-            out = (out if out.dim() == data.dim() + 2 else out.squeeze(-2)).movedim(0, -2)
-        else:
+        if members is not None:
+            params, members = self._params_of(params, members)
+        if self._together:
             with params.to_module(self.qvalue_network, preserve_module_state=False):
-                out = self.qvalue_network(data).get(self.tensor_keys.state_action_value)
-            if out.dim() == data.dim() + 1:  # [*B, critics], or what a single critic with a head writes
-                out = out.unsqueeze(-2 if self.head.size > 1 and self.num_critics == 1 else -1)
-        if (out.shape[-1] > 1) != (self.head.size > 1) or out.shape[-2] != (number or out.shape[-2]):
-            outputs = "one output" if self.head.size == 1 else f"{self.head.size} outputs"
-            advice = f"give the critics the head (modules.q_value(env, {self.num_critics}, head=...))"
-            if self.head.size == 1:
-                advice += f", or, if one network writes several critics' values, network.num_critics = {out.shape[-1]}"
-            raise UserError(
-                f"{self.head} needs {outputs} of each of the {self.num_critics} critics, there are "
-                f"{out.shape[-1]} of {out.shape[-2]}: {advice}"
-            )
+                out = self.qvalue_network(data).get(key)
+            out = out.unsqueeze(data.dim()) if self.num_critics == 1 else out  # [*B, size]
+        else:
+            out = self._each(data, params).get(key).movedim(0, data.dim())
+        out = out.unsqueeze(-1) if out.dim() == data.dim() + 1 else out.flatten(data.dim() + 1)
         return out if members is None else out[..., members, :]
 
-    def params_of(self, params: Any, members: Tensor | slice | None) -> tuple[Any, Tensor | slice | None]:
-        """``params`` of the critics ``members``, None: of all; and what is left to take out of the results."""
-        if members is None:
-            return params, None
-        if self._each is not None:
+    def _params_of(self, params: Any, members: Tensor | slice) -> tuple[Any, Members]:
+        """``params`` of the critics ``members``, and what is left to take out of the results."""
+        if not self._together:
             return params[members], None
         pick = getattr(self.qvalue_network, "members", None)
         picked = None if pick is None else pick(params, members)
         return (params, members) if picked is None else (picked, None)
 
-    def q(self, batch: TensorDictBase, action: Tensor, params: Any, members: Tensor | slice | None = None) -> Tensor:
+    def _other_outputs(self, out: Tensor) -> str:
+        wanted = "one output" if self.head.size == 1 else f"{self.head.size} outputs"
+        advice = f"give the critics the head (modules.q_value(env, {self.num_critics}, head=...))"
+        if self.head.size == 1:
+            written = out.shape[-2] * out.shape[-1]
+            advice += f", or, if one network writes several critics' values, network.num_critics = {written}"
+        return (
+            f"{self.head} needs {wanted} of each of the {self.num_critics} critics, there are "
+            f"{out.shape[-1]} of {out.shape[-2]}: {advice}"
+        )
+
+    def min_q(self, batch: TensorDictBase, action: Any, params: Any, members: Members = None) -> Returns:
+        r"""The least of the critics' returns of ``action``, :math:`\min_i Q_i`; each head has its own least."""
+        return self.head.least(self.outputs(batch, action, params, members))
+
+    def q(self, batch: TensorDictBase, action: Any, params: Any, members: Members = None) -> Tensor:
         """The critics' values ``[*B, critics]`` of ``action`` at the batch's observations."""
-        return self.head.mean(self.returns(batch, action, params, members))
+        return self.head.mean(self.outputs(batch, action, params, members))
 
-    def target(self, batch: TensorDictBase, next_value: Tensor) -> Tensor:
-        """The bootstrapped target of the next state's value ``[*B]``, or of its atoms ``[*B, K]``; same shape."""
+    def target(self, batch: TensorDictBase, next_returns: Returns) -> Returns:
+        r"""The bootstrapped target :math:`r + \gamma^n (1 - \text{terminated}) Z(s_{t+n})`, ``[*B]``."""
         keys, after = self.tensor_keys, batch["next"]
-        atoms = next_value.reshape(*batch.batch_size, -1)
-        reward, terminated = (after[key].expand_as(atoms) for key in (keys.reward, keys.terminated))
+        reward, terminated = (after[key].reshape(batch.batch_size) for key in (keys.reward, keys.terminated))
         steps = batch.get(keys.steps_to_next_obs, None)
-        steps = None if steps is None else steps.reshape(*batch.batch_size, 1)  # TorchRL's MultiStep drops the 1
-        return bootstrap_target(reward, atoms, terminated, self.gamma, steps).reshape(next_value.shape)
+        steps = None if steps is None else steps.reshape(batch.batch_size)
+        gamma = self.gamma.to(next_returns.dtype)  # gamma ** steps would be float64 for any
+        target = bootstrap_target(reward, next_returns, terminated, gamma, steps)
+        return target.mixed() if self.augmented else target
 
-    def weight(self, batch: TensorDictBase) -> Tensor | float:
-        """The importance weights ``[*B]`` of a prioritized replay, 1 for any other."""
+    def regress(self, batch: TensorDictBase, outputs: Tensor, target: Returns) -> tuple[Tensor, Tensor]:
+        """The loss of the critics' ``outputs [*B, critics, size]`` at the target, reduced, and their values.
+
+        Writes the priority, and weighs each row by the importance weight of a prioritized replay.
+
+        Returns:
+            The loss and ``[*B, critics]``.
+        """
+        q = self.head.mean(outputs)
+        error = q.detach() - target.mean.unsqueeze(-1)
+        batch.set(self.tensor_keys.priority, error.abs().amax(-1))
         weight = batch.get(self.tensor_keys.priority_weight, None)
-        return 1.0 if weight is None else weight.reshape(batch.batch_size)
+        loss = self.head.loss(outputs, target).sum(-1)
+        return self.reduce(loss if weight is None else loss * weight.reshape(batch.batch_size), batch), q
 
-    def write_priority(self, batch: TensorDictBase, td_error: Tensor) -> None:
-        """Writes the largest error of the critics, ``[*B, critics]`` in absolute value, into the batch."""
-        batch.set(self.tensor_keys.priority, td_error.detach().abs().amax(-1))
+    def first(self, batch: Any) -> Any:
+        """What the actor learns on, of a batch or a tensor: all of it, of augmented copies the first."""
+        return batch[0] if self.augmented else batch
 
     def make_value_estimator(self, value_type: ValueEstimators | None = None, **hyperparams: Any) -> QLoss:
         """As in TorchRL: sets ``gamma``. One- and n-step targets come from the replay, so only ``TD0`` is known."""
@@ -210,11 +243,17 @@ class QLoss(Loss):
         return [keys.action, *networks, *[("next", *((key,) if isinstance(key, str) else key)) for key in after]]
 
 
-def refuse_stochastic(loss: str, actor: TensorDictModule) -> None:
-    """Raises ``UserError`` for an actor that draws its actions from a distribution."""
-    kinds = [getattr(module, "distribution_class", None) for module in actor.modules()]
-    if any(kind is not None and not issubclass(kind, Delta | TanhDelta) for kind in kinds):
-        raise UserError(
-            f"{loss} needs an actor that gives one action, this one draws it from a distribution: use "
-            "modules.deterministic_actor, or losses.SACLoss for this actor"
-        )
+def _arranged(critics: Critics, number: int) -> tuple[list[TensorDictModule], int, bool]:
+    """The critics' networks, how many critics these are, and whether one network is used as it is."""
+    several = isinstance(critics, list | tuple)
+    networks = list(critics) if several else [critics]
+    own = getattr(networks[0], "num_critics", None)
+    if len(networks) == 1 and (several or number == 1 or own is not None):
+        return networks, own or 1, True
+    return networks, len(networks) if several else number, False
+
+
+def head_of(critics: Critics) -> Head | None:
+    """The head that the critics bring along."""
+    head = getattr(critics[0] if isinstance(critics, list | tuple) else critics, "head", None)
+    return head if isinstance(head, Head) else None

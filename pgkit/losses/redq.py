@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from tensordict.nn import TensorDictModule
+from typing_extensions import Unpack
 
-import torch
-from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule, dispatch
-
-from pgkit.functional import same_shape, soft_returns
-from pgkit.losses.soft_base import SoftQLoss
+from pgkit.losses.q_base import Critics
+from pgkit.losses.soft_base import SoftQLoss, SoftSettings
 
 
 class REDQLoss(SoftQLoss):
@@ -31,9 +27,9 @@ class REDQLoss(SoftQLoss):
     Args:
         actor_network: as in :class:`~pgkit.losses.SACLoss`.
         qvalue_network: likewise; with a head its pool takes the minimum's place.
-        num_qvalue_nets: N, where ``qvalue_network`` is one module; an ensemble or a list brings its own.
         sub_sample_len: M.
-        settings: the other settings of :class:`~pgkit.losses.SoftQLoss`; its ``actor_value`` is ``mean`` here.
+        settings: those of :class:`~pgkit.losses.SoftQLoss`; ``num_qvalue_nets`` is N, 10 by default, where
+            ``qvalue_network`` is one module, and ``actor_value`` is ``mean``.
 
     Writes what ``SACLoss`` writes.
     """
@@ -41,33 +37,10 @@ class REDQLoss(SoftQLoss):
     def __init__(
         self,
         actor_network: TensorDictModule,
-        qvalue_network: TensorDictModule | Sequence[TensorDictModule],
+        qvalue_network: Critics,
         *,
-        num_qvalue_nets: int = 10,
         sub_sample_len: int = 2,
-        **settings: Any,
+        **settings: Unpack[SoftSettings],
     ) -> None:
-        settings = {"subset": sub_sample_len, "actor_value": "mean", "num_qvalue_nets": num_qvalue_nets, **settings}
-        super().__init__(actor_network, qvalue_network, **settings)
-
-    @dispatch
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Losses and metrics of a batch ``[*B]`` of transitions; nothing in it is changed, ``td_error`` is added."""
-        batch, alpha = tensordict, self.alpha
-
-        with torch.no_grad():
-            subset = self.draw()
-            next_action, next_log_prob = self.act(batch["next"], self.target_actor_network_params)
-            next_returns = self.returns(batch["next"], next_action, self.target_qvalue_network_params, subset)
-            atoms, weights = self.head.pool(next_returns)
-            atoms = self.target(batch, soft_returns(atoms, next_log_prob, alpha))
-
-        returns = self.returns(batch, batch[self.tensor_keys.action], self.qvalue_network_params)
-        qvalue_loss = self.head.loss(returns, atoms, weights).sum(-1) * self.weight(batch)
-        q = self.head.mean(returns)
-        self.write_priority(batch, q - (atoms * weights).sum(-1, keepdim=True))
-
-        action, log_prob = self.act(batch, self.actor_network_params)
-        value = self.actor_value(self.q(batch, action, self.qvalue_network_params.detach()))
-        same_shape(log_prob=log_prob, value=value)
-        return self.result(batch, alpha * log_prob - value, qvalue_loss, action, log_prob, q)
+        own = SoftSettings(num_qvalue_nets=10, subset=sub_sample_len, actor_value="mean")
+        super().__init__(actor_network, qvalue_network, **(own | settings))

@@ -8,10 +8,10 @@ from tensordict.utils import NestedKey
 
 from pgkit.functional import policy_gradient
 from pgkit.functional.values import Distance
-from pgkit.losses.actor_critic_base import ActorCriticLoss
+from pgkit.losses.policy_base import PolicyLoss
 
 
-class ReinforceLoss(ActorCriticLoss):
+class ReinforceLoss(PolicyLoss):
     r"""REINFORCE, a drop-in for TorchRL's loss of that name.
 
     .. math::
@@ -23,7 +23,7 @@ class ReinforceLoss(ActorCriticLoss):
     Args:
         actor_network: probabilistic actor.
         critic_network: the baseline; None: there is none.
-        loss_critic_type, clip_value, separate_losses, reduction: as in :class:`~pgkit.losses.ActorCriticLoss`.
+        loss_critic_type, clip_value, separate_losses, reduction: as in :class:`~pgkit.losses.PolicyLoss`.
 
     Writes ``loss_actor``, ``loss_value`` and the metric ``explained_variance``.
     """

@@ -2,11 +2,6 @@
 
 from __future__ import annotations
 
-import torch
-from tensordict import TensorDictBase
-from tensordict.nn import dispatch
-
-from pgkit.functional import same_shape, soft_returns
 from pgkit.losses.soft_base import SoftQLoss
 
 
@@ -33,24 +28,3 @@ class SACLoss(SoftQLoss):
     Writes ``loss_actor``, ``loss_qvalue``, ``loss_alpha`` and the metrics ``alpha``, ``entropy``, ``q_value``; and
     ``td_error [*B]`` into the batch, the priority of a prioritized replay.
     """
-
-    @dispatch
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Losses and metrics of a batch ``[*B]`` of transitions; nothing in it is changed, ``td_error`` is added."""
-        batch, alpha = tensordict, self.alpha
-
-        with torch.no_grad():
-            next_action, next_log_prob = self.act(batch["next"], self.target_actor_network_params)
-            next_returns = self.returns(batch["next"], next_action, self.target_qvalue_network_params, self.draw())
-            atoms, weights = self.head.pool(next_returns)
-            atoms = self.target(batch, soft_returns(atoms, next_log_prob, alpha))
-
-        returns = self.returns(batch, batch[self.tensor_keys.action], self.qvalue_network_params)
-        qvalue_loss = self.head.loss(returns, atoms, weights).sum(-1) * self.weight(batch)
-        q = self.head.mean(returns)
-        self.write_priority(batch, q - (atoms * weights).sum(-1, keepdim=True))
-
-        action, log_prob = self.act(batch, self.actor_network_params)
-        value = self.actor_value(self.q(batch, action, self.qvalue_network_params.detach()))
-        same_shape(log_prob=log_prob, value=value)
-        return self.result(batch, alpha * log_prob - value, qvalue_loss, action, log_prob, q)

@@ -1,26 +1,43 @@
-"""What the entropy-regularized off-policy losses share: the temperature and TorchRL's settings for it."""
+"""What the entropy-regularized off-policy losses share: the temperature, and the forward of SAC, REDQ and TQC."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from math import log
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModule
+from tensordict.nn import TensorDictModule, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
-from torchrl.data import Composite, TensorSpec
+from torchrl.data import TensorSpec
+from typing_extensions import Unpack
 
+from pgkit.controllers import FixedTemperature, Temperature
 from pgkit.errors import UserError
-from pgkit.functional import ensemble_mean, random_subset, temperature_loss, twin_minimum
-from pgkit.heads import Head
-from pgkit.losses.q_base import QLoss
+from pgkit.functional import ensemble_mean, random_subset, same_shape, twin_minimum
+from pgkit.losses.actors import action_spec_of, dimensions, need_distribution, need_kind
+from pgkit.losses.q_base import Critics, QLoss, QSettings
+
+_ACTOR_VALUES = {"min": twin_minimum, "mean": ensemble_mean}
+
+
+class SoftSettings(QSettings, total=False):
+    """Keywords of :class:`SoftQLoss`, which says what they mean and what they default to."""
+
+    temperature: nn.Module | None
+    alpha_init: float
+    min_alpha: float | None
+    max_alpha: float | None
+    fixed_alpha: bool
+    target_entropy: str | float
+    action_spec: TensorSpec | None
+    loss_function: str
+    subset: int | None
+    actor_value: str
 
 
 class SoftQLoss(QLoss):
-    r"""Base of SAC and its descendants: a :class:`~pgkit.losses.QLoss` with a temperature :math:`\alpha`.
+    r"""SAC and its descendants: a :class:`~pgkit.losses.QLoss` with a temperature :math:`\alpha`.
 
     Args:
         actor_network: probabilistic actor.
@@ -34,7 +51,7 @@ class SoftQLoss(QLoss):
         loss_function: distance of scalar critics: ``l2``, ``l1`` or ``smooth_l1``.
         subset: so many critics, drawn anew at every call, make the target (REDQ's M); None: all.
         actor_value: the actor maximizes the ``min`` or the ``mean`` of the critics.
-        num_qvalue_nets, gamma, delay_actor, delay_qvalue, separate_losses, reduction, head: as in ``QLoss``.
+        settings: those of ``QLoss``.
 
     Raises:
         UserError: the actor is discrete and the loss is not, or the other way round (``takes_discrete``); ``subset`` is
@@ -43,12 +60,12 @@ class SoftQLoss(QLoss):
 
     takes_discrete: ClassVar[bool] = False
     log_alpha: Tensor
-    _schedulable_buffers: ClassVar[frozenset[str]] = frozenset({"gamma", "log_alpha"})
+    _schedulable_buffers: ClassVar[frozenset[str]] = frozenset({"gamma"})
 
     def __init__(
         self,
         actor_network: TensorDictModule,
-        qvalue_network: TensorDictModule | Sequence[TensorDictModule],
+        qvalue_network: Critics,
         *,
         temperature: nn.Module | None = None,
         alpha_init: float = 1.0,
@@ -60,72 +77,51 @@ class SoftQLoss(QLoss):
         loss_function: str = "l2",
         subset: int | None = None,
         actor_value: str = "min",
-        num_qvalue_nets: int = 2,
-        gamma: float = 0.99,
-        delay_actor: bool = False,
-        delay_qvalue: bool = True,
-        separate_losses: bool = False,
-        reduction: str | None = None,
-        head: Head | None = None,
+        **settings: Unpack[QSettings],
     ) -> None:
-        _check_actions(type(self).__name__, actor_network, self.takes_discrete)
-        super().__init__(
-            actor_network, qvalue_network, num_qvalue_nets=num_qvalue_nets, gamma=gamma, delay_actor=delay_actor,
-            delay_qvalue=delay_qvalue, separate_losses=separate_losses, reduction=reduction, head=head,
-        )  # fmt: skip
-        if temperature is not None and not (hasattr(temperature, "alpha") and hasattr(temperature, "loss")):
-            raise UserError(
-                f"temperature={temperature!r}: give a block with alpha and loss (controllers.Temperature, "
-                "controllers.FixedTemperature(0.2))"
-            )
-        if temperature is not None and not (isinstance(temperature.alpha, Tensor) and temperature.alpha.numel() == 1):
-            raise UserError(
-                f"{type(temperature).__name__}.alpha is {temperature.alpha!r}: make it a tensor of one number"
-            )
+        super().__init__(actor_network, qvalue_network, **settings)
+        need_distribution(type(self).__name__, actor_network, "modules.tanh_normal_actor")
+        need_kind(type(self).__name__, actor_network, self.takes_discrete)
         self.set_distance(loss_function)
         if subset is not None and not 1 <= subset <= self.num_critics:
             raise UserError(f"subset={subset} of {self.num_critics} critics: give a number from 1 to the latter")
-        values = {"min": twin_minimum, "mean": ensemble_mean}
-        if actor_value not in values:
+        if actor_value not in _ACTOR_VALUES:
             raise UserError(f"actor_value={actor_value!r}: give 'min' or 'mean'")
-        if alpha_init <= 0:
-            raise UserError(f"alpha_init={alpha_init:g}: give a number above 0")
-        self.subset, self.actor_value = subset, values[actor_value]
-        self.temperature: Any = temperature
-        if temperature is None:
-            log_alpha = torch.tensor(log(alpha_init))
-            if fixed_alpha:
-                self.register_buffer("log_alpha", log_alpha)
-            else:
-                self.log_alpha = nn.Parameter(log_alpha)
-        self._log_bounds = (log(min_alpha) if min_alpha else None, log(max_alpha) if max_alpha else None)
-        self.fixed_alpha, self.loss_function = fixed_alpha, loss_function
-        self._target_entropy = None if target_entropy == "auto" else float(target_entropy)
-        if isinstance(action_spec, Composite):
-            action_spec = action_spec[self.tensor_keys.action]
-        if self._target_entropy is None and action_spec is not None:
-            self._target_entropy = -float(action_spec.shape[-1:].numel())
+        self.subset, self.actor_value = subset, _ACTOR_VALUES[actor_value]
+        spec = action_spec_of(actor_network, self.tensor_keys.action, action_spec)
+        target = self.automatic_entropy(spec) if target_entropy == "auto" else float(target_entropy)
+        self._automatic = temperature is None and target is None
+        if temperature is not None:
+            self.temperature: Any = _checked(temperature)
+        elif fixed_alpha:
+            self.temperature = FixedTemperature(alpha_init)
+        else:  # where the target is not known yet, each batch adds it to 0
+            self.temperature = Temperature(target or 0.0, alpha_init, min_alpha=min_alpha, max_alpha=max_alpha)
+            self.log_alpha = self.temperature.log_alpha  # by TorchRL's name
+
+    def automatic_entropy(self, spec: Any) -> float | None:
+        """The target entropy that ``auto`` means: minus the dimensions of the action; None without its spec."""
+        return None if spec is None else -float(dimensions(spec))
+
+    def seen_entropy(self, action: Any, log_prob: Tensor) -> float:
+        """The same, read off a batch of actions and their log-probabilities."""
+        parts = [action] if isinstance(action, Tensor) else list(action.values(True, True))
+        return -sum(part.numel() for part in parts) / log_prob.numel()
 
     @property
     def alpha(self) -> Tensor:
         r"""The temperature :math:`\alpha`, a detached scalar."""
-        if self.temperature is not None:
-            return self.temperature.alpha.detach().clone()  # a controller may move it while the loss is computed
-        with torch.no_grad():
-            bounded = self._log_bounds != (None, None)
-            return (self.log_alpha.clamp_(*self._log_bounds) if bounded else self.log_alpha).exp()
+        return self.temperature.alpha.detach().clone()  # a controller may move it while the loss is computed
 
     @property
-    def target_entropy(self) -> float:
-        r""":math:`\bar H`; with ``auto`` and no ``action_spec``, known after the first batch."""
-        if self.temperature is not None:
-            target = getattr(self.temperature, "target_entropy", None)
-            if target is None:
-                raise UserError(f"{type(self.temperature).__name__} has no target_entropy")
-            return target
-        if self._target_entropy is None:
-            raise UserError("target_entropy='auto' is read off the first batch of actions: none was seen yet")
-        return self._target_entropy
+    def target_entropy(self) -> Tensor:
+        r""":math:`\bar H`, a scalar; with ``auto``, known where the loss or the actor has the action's spec."""
+        if self._automatic:
+            raise UserError("target_entropy='auto' is read off each batch: give action_spec= to know it before")
+        target = getattr(self.temperature, "target_entropy", None)
+        if target is None:
+            raise UserError(f"{type(self.temperature).__name__} has no target_entropy")
+        return target
 
     def draw(self) -> Tensor | None:
         """The critics that make this call's target, ``[subset]``; None: all."""
@@ -133,67 +129,81 @@ class SoftQLoss(QLoss):
             return None
         return random_subset(self.num_critics, self.subset, self.gamma.device)
 
-    def temperature_loss(self, action: Tensor, log_prob: Tensor) -> Tensor:
-        """Unreduced ``[*B]`` loss of the temperature at actions ``[*B, actions]`` drawn now, ``log_prob [*B]``."""
-        log_prob = log_prob.detach()
-        if self.temperature is not None:
-            return self.temperature.loss(log_prob)
-        if self._target_entropy is None:
-            self._target_entropy = -action.numel() / log_prob.numel()
-        return temperature_loss(self.log_alpha, log_prob, self._target_entropy)
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Losses and metrics of a batch ``[*B]`` of transitions; nothing in it is changed, ``td_error`` is added."""
+        batch, alpha = tensordict, self.alpha
+
+        with torch.no_grad():
+            members = self.draw()
+            next_action, next_log_prob = self.act(batch["next"], self.target_actor_network_params)
+            min_q = self.min_q(batch["next"], next_action, self.target_qvalue_network_params, members)
+            target = self.target(batch, min_q - alpha * next_log_prob)
+
+        outputs = self.outputs(batch, batch[self.tensor_keys.action], self.qvalue_network_params)
+        loss_qvalue, q = self.regress(batch, outputs, target)
+
+        batch = self.first(batch)
+        action, log_prob = self.act(batch, self.actor_network_params)
+        value = self.actor_value(self.q(batch, action, self.qvalue_network_params.detach()))
+        same_shape(log_prob=log_prob, value=value)
+        loss_actor = self.reduce(alpha * log_prob - value, batch)
+        return self.result(batch, loss_actor, loss_qvalue, action, log_prob, q)
 
     def result(
         self,
         batch: TensorDictBase,
-        actor: Tensor,
-        qvalue: Tensor,
-        action: Tensor,
+        loss_actor: Tensor,
+        loss_qvalue: Tensor,
+        action: Any,
         log_prob: Tensor,
         q: Tensor,
         out_of_reach: Tensor | float = 0.0,
     ) -> TensorDict:
-        """The three losses of the unreduced ``[*B]``, and the metrics; ``log_prob [*B]`` is that of ``action``.
+        """The losses, that of the temperature included, and the metrics.
 
-        ``out_of_reach [*B]`` is the part of the target entropy that is not asked of a row.
+        Args:
+            batch: what the actor learned on, ``[*B]``.
+            loss_actor, loss_qvalue: reduced.
+            action: drawn there, ``[*B, actions]``.
+            log_prob: its log-probability, ``[*B]``.
+            q: the critics' values of the batch's actions.
+            out_of_reach: the part of the target entropy that is not asked of a row, ``[*B]``.
         """
-        out = TensorDict(
-            {
-                "loss_actor": self.reduce(actor, batch),
-                "loss_qvalue": self.reduce(qvalue, batch),
-                "loss_alpha": self.reduce(self.temperature_loss(action, log_prob - out_of_reach), batch),
-            }
-        )
-        out["alpha"], out["entropy"], out["q_value"] = self.alpha, -log_prob.detach().mean(), q.detach().mean()
+        entropy = -log_prob.detach()
+        missing = (self.seen_entropy(action, log_prob) if self._automatic else 0.0) - out_of_reach
+        loss_alpha = self.reduce(self.temperature.loss(missing - entropy), batch)
+        out = TensorDict({"loss_actor": loss_actor, "loss_qvalue": loss_qvalue, "loss_alpha": loss_alpha})
+        out["alpha"], out["entropy"], out["q_value"] = self.alpha, entropy.mean(), q.detach().mean()
         return out
 
     def _writes(self) -> list[NestedKey]:
         return ["loss_actor", "loss_qvalue", "loss_alpha", "alpha", "entropy", "q_value"]
 
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
+        before = state_dict.get(f"{prefix}log_alpha")  # all that was saved when this loss had no temperature block
+        if before is not None and isinstance(self.temperature, FixedTemperature):
+            state_dict.setdefault(f"{prefix}temperature.alpha", state_dict.pop(f"{prefix}log_alpha").exp())
+        elif before is not None:
+            state_dict.setdefault(f"{prefix}temperature.log_alpha", before)
+        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
-def _check_actions(loss: str, actor: TensorDictModule, discrete: bool) -> None:
-    if hasattr(actor, "in_keys") and not hasattr(actor, "dist_sample_keys"):
+
+@runtime_checkable
+class _Weight(Protocol):
+    """What weighs the entropy."""
+
+    alpha: Tensor
+
+    def loss(self, log_prob: Tensor, /) -> Tensor: ...
+
+
+def _checked(temperature: nn.Module) -> nn.Module:
+    if not isinstance(temperature, _Weight):
         raise UserError(
-            f"{loss} needs an actor that draws from a distribution (modules.tanh_normal_actor), this one gives one "
-            "action: losses.TD3Loss and losses.DDPGLoss take it"
+            f"temperature={temperature!r}: give a block with alpha and loss (controllers.Temperature, "
+            "controllers.FixedTemperature(0.2))"
         )
-    for module in actor.modules():
-        kind = getattr(module, "distribution_class", None)
-        if kind is None:
-            continue
-        if discrete and not getattr(kind, "has_rsample", True) and not hasattr(kind, "logits"):
-            raise UserError(
-                f"{loss} takes one discrete action, this actor draws {kind.__name__} ones: losses.ClipPPOLoss and "
-                "losses.A2CLoss take it"
-            )
-        if discrete == (not getattr(kind, "has_rsample", True)):
-            continue
-        if discrete:
-            raise UserError(
-                f"{loss} needs an actor over discrete actions, this one is {kind.__name__}: use "
-                "modules.categorical_actor, or losses.SACLoss for this actor"
-            )
-        raise UserError(
-            f"{loss} needs an actor over continuous actions, this one is {kind.__name__}: use "
-            "modules.tanh_normal_actor, or for discrete actions modules.categorical_actor with "
-            "losses.DiscreteSACLoss or losses.ClipPPOLoss"
-        )
+    if not (isinstance(temperature.alpha, Tensor) and temperature.alpha.numel() == 1):
+        raise UserError(f"{type(temperature).__name__}.alpha is {temperature.alpha!r}: make it a tensor of one number")
+    return temperature

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -10,12 +9,13 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data import Bounded, Composite, TensorSpec
+from torchrl.data import Bounded, TensorSpec
+from typing_extensions import Unpack
 
 from pgkit.errors import UserError
 from pgkit.functional import smoothed_action
-from pgkit.heads import Head
-from pgkit.losses.q_base import QLoss, refuse_stochastic
+from pgkit.losses.actors import action_spec_of, refuse_stochastic
+from pgkit.losses.q_base import Critics, QLoss, QSettings
 
 
 class TD3Loss(QLoss):
@@ -43,7 +43,7 @@ class TD3Loss(QLoss):
         policy_noise: :math:`\sigma`, in the unit of the action; a number, or a tensor ``[actions]``.
         noise_clip: :math:`c`, likewise.
         loss_function: distance of scalar critics: ``l2``, ``l1`` or ``smooth_l1``.
-        num_qvalue_nets, gamma, delay_actor, delay_qvalue, separate_losses, reduction, head: as in ``QLoss``.
+        settings: those of ``QLoss``; ``delay_actor`` is True by default.
 
     Writes ``loss_actor``, ``loss_qvalue`` and, as means, the metrics ``pred_value``, ``state_action_value_actor``,
     ``next_state_value``, ``target_value``; and ``td_error [*B]`` into the batch, the priority of a prioritized replay.
@@ -61,40 +61,25 @@ class TD3Loss(QLoss):
     def __init__(
         self,
         actor_network: TensorDictModule,
-        qvalue_network: TensorDictModule | Sequence[TensorDictModule],
+        qvalue_network: Critics,
         *,
         action_spec: TensorSpec | None = None,
         bounds: tuple[float | Tensor, float | Tensor] | None = None,
-        num_qvalue_nets: int = 2,
         policy_noise: float | Tensor = 0.2,
         noise_clip: float | Tensor = 0.5,
         loss_function: str = "l2",
-        gamma: float = 0.99,
-        delay_actor: bool = True,
-        delay_qvalue: bool = True,
-        separate_losses: bool = False,
-        reduction: str | None = None,
-        head: Head | None = None,
+        **settings: Unpack[QSettings],
     ) -> None:
         if (action_spec is None) == (bounds is None):
             raise UserError("TD3Loss clips its smoothed actions: give it action_spec= or bounds=, one of the two")
+        super().__init__(actor_network, qvalue_network, **(QSettings(delay_actor=True) | settings))
         refuse_stochastic("TD3Loss", actor_network)
-        super().__init__(
-            actor_network, qvalue_network, num_qvalue_nets=num_qvalue_nets, gamma=gamma, delay_actor=delay_actor,
-            delay_qvalue=delay_qvalue, separate_losses=separate_losses, reduction=reduction, head=head,
-        )  # fmt: skip
-        if isinstance(action_spec, Composite):
-            action_spec = action_spec[self.tensor_keys.action]
-        if bounds is None and not isinstance(action_spec, Bounded):
-            raise UserError(
-                f"TD3Loss clips its smoothed actions: their spec must be Bounded, this one is {action_spec}"
-            )
-        space: Any = getattr(action_spec, "space", None)
-        low, high = bounds or (x[(0,) * (x.dim() - 1)] for x in (space.low, space.high))  # of a vector: the first's
+        self.set_distance(loss_function)
+        low, high = bounds or _bounds(action_spec_of(actor_network, self.tensor_keys.action, action_spec))
         numbers = {"min_action": low, "max_action": high, "policy_noise": policy_noise, "noise_clip": noise_clip}
         for name, number in numbers.items():
-            self.register_buffer(name, torch.as_tensor(number))
-        self.set_distance(loss_function)
+            exact = number if isinstance(number, Tensor) else torch.tensor(number, dtype=torch.float64)
+            self.register_buffer(name, exact)
 
     def _writes(self) -> list[NestedKey]:
         metrics = ["pred_value", "state_action_value_actor", "next_state_value", "target_value"]
@@ -110,24 +95,26 @@ class TD3Loss(QLoss):
                 self.action(batch["next"], self.target_actor_network_params),
                 self.policy_noise, self.noise_clip, self.min_action, self.max_action,
             )  # fmt: skip
-            next_returns = self.returns(batch["next"], next_action, self.target_qvalue_network_params)
-            next_atoms, weights = self.head.pool(next_returns)
-            atoms = self.target(batch, next_atoms)
+            min_q = self.min_q(batch["next"], next_action, self.target_qvalue_network_params)
+            target = self.target(batch, min_q)
 
-        returns = self.returns(batch, batch[self.tensor_keys.action], self.qvalue_network_params)
-        qvalue_loss = self.head.loss(returns, atoms, weights).sum(-1) * self.weight(batch)
-        q, target = self.head.mean(returns), (atoms * weights).sum(-1, keepdim=True)
-        self.write_priority(batch, q - target)
+        outputs = self.outputs(batch, batch[self.tensor_keys.action], self.qvalue_network_params)
+        loss_qvalue, q = self.regress(batch, outputs, target)
 
+        batch = self.first(batch)
         action = self.action(batch, self.actor_network_params)
-        value = self.q(batch, action, self.qvalue_network_params.detach(), slice(1)).squeeze(-1)
+        q1 = self.q(batch, action, self.qvalue_network_params.detach(), slice(1)).squeeze(-1)
 
-        out = TensorDict(
-            {
-                "loss_actor": self.reduce(-value, batch),
-                "loss_qvalue": self.reduce(qvalue_loss, batch),
-            }
-        )
-        out["pred_value"], out["state_action_value_actor"] = q.detach().mean(), value.detach().mean()
-        out["next_state_value"], out["target_value"] = (next_atoms * weights).sum(-1).mean(), target.mean()
+        out = TensorDict({"loss_actor": self.reduce(-q1, batch), "loss_qvalue": loss_qvalue})
+        out["pred_value"], out["state_action_value_actor"] = q.detach().mean(), q1.detach().mean()
+        out["next_state_value"], out["target_value"] = min_q.mean.mean(), target.mean.mean()
         return out
+
+
+def _bounds(spec: Any) -> tuple[Tensor, Tensor]:
+    """Least and largest action ``[actions]``, of a vector's spec those of its first environment."""
+    if not isinstance(spec, Bounded):
+        raise UserError(f"TD3Loss clips its smoothed actions: their spec must be Bounded, this one is {spec}")
+    space: Any = spec.space
+    low, high = (x[(0,) * (x.dim() - 1)] for x in (space.low, space.high))
+    return low, high

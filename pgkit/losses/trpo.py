@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import dispatch
-from tensordict.utils import NestedKey
 
 from pgkit.functional import ratio_surrogate
-from pgkit.losses.actor_critic_base import ActorCriticLoss
+from pgkit.losses.policy_base import PolicyLoss
 
 
-class TRPOLoss(ActorCriticLoss):
+class TRPOLoss(PolicyLoss):
     r"""The surrogate of TRPO and of the natural policy gradient, and the value loss beside it.
 
     .. math::
@@ -20,13 +19,10 @@ class TRPOLoss(ActorCriticLoss):
     The constraint on :math:`KL(\pi_{old} \| \pi)` (:meth:`kl`) is the business of
     :class:`pgkit.updates.TrustRegionUpdate`.
 
-    The arguments are those of :class:`~pgkit.losses.ActorCriticLoss`.
+    The arguments are those of :class:`~pgkit.losses.PolicyLoss`.
 
     Writes ``loss_objective``, ``loss_critic``, ``loss_entropy`` and the metrics ``entropy``, ``explained_variance``.
     """
-
-    def _writes(self) -> list[NestedKey]:
-        return ["loss_objective", *super()._writes()]
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -34,8 +30,4 @@ class TRPOLoss(ActorCriticLoss):
         batch = tensordict.copy()
         advantage, dist = self.get_advantage(batch), self.distribution(batch)
         objective = ratio_surrogate(self.log_ratio(dist, batch), advantage)
-
-        out = TensorDict({"loss_objective": self.reduce(-objective, batch)})
-        self.add_entropy(out, dist, batch)
-        self.add_critic(out, batch)
-        return out
+        return self.result(batch, objective, dist)

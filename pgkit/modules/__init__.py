@@ -1,8 +1,10 @@
 """Networks, actors, value operators and normalizers: TensorDict modules and their builders."""
 
 from pgkit.modules.actors import actor, gaussian_actor, tanh_normal_actor
+from pgkit.modules.augmentations import random_shift
 from pgkit.modules.bodies import Encoder, batch_renorm_mlp, ensemble_mlp, simba
 from pgkit.modules.causal_lm import causal_lm, token_value
+from pgkit.modules.convolutions import ConvEncoder, Detached, conv_encoder, decoder
 from pgkit.modules.deterministic import deterministic_actor
 from pgkit.modules.discrete import categorical_actor
 from pgkit.modules.encoders import dict_encoder
@@ -17,6 +19,8 @@ from pgkit.modules.tokens import TokenActor, TokenDistribution, TokenPolicy, Tok
 from pgkit.modules.values import state_value
 
 __all__ = [
+    "ConvEncoder",
+    "Detached",
     "Encoder",
     "EnsembleBatchRenorm",
     "EnsembleDropout",
@@ -35,6 +39,8 @@ __all__ = [
     "batch_renorm_mlp",
     "categorical_actor",
     "causal_lm",
+    "conv_encoder",
+    "decoder",
     "deterministic_actor",
     "dict_encoder",
     "discrete_q_value",
@@ -46,6 +52,7 @@ __all__ = [
     "lstm",
     "mlp",
     "q_value",
+    "random_shift",
     "simba",
     "state_value",
     "tanh_normal_actor",

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from math import prod
-from typing import Any
+from typing import Any, cast
 
 import torch
-from tensordict.nn import InteractionType, TensorDictModule
+from tensordict.nn import InteractionType
+from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch.distributions import Distribution
 from torchrl.envs import EnvBase
 from torchrl.modules import IndependentNormal, ProbabilisticActor, TanhNormal
 
-from pgkit.modules.mlp import orthogonal
-from pgkit.modules.sizes import action_size, box_action
-from pgkit.modules.trunk import headed, trunk
+from pgkit.modules.groups import Agents, Share, agents
+from pgkit.modules.sizes import box_action
+from pgkit.modules.trunk import Trunk, headed, trunk
 
 
 def gaussian_actor(
@@ -26,6 +27,10 @@ def gaussian_actor(
     log_std: float = -0.5,
     normalizer: nn.Module | None = None,
     encoder: nn.Module | None = None,
+    group: str | None = None,
+    share_parameters: Share = True,
+    agent_ids: bool = False,
+    device: torch.device | str | None = None,
 ) -> ProbabilisticActor:
     """A Gaussian whose mean depends on the state and whose standard deviation is one free parameter a dimension.
 
@@ -40,10 +45,17 @@ def gaussian_actor(
         encoder: replaces the hidden layers; its output feeds the head. It is called with the observation, or with the
             entries that its attribute ``in_keys`` names (:func:`~pgkit.modules.dict_encoder`). Give the same one
             to :func:`~pgkit.modules.state_value` to share it.
+        group: of many agents, the group whose actions these are (``("agents", "action") [*B, agents, actions]``); found
+            by itself if it is the only one.
+        share_parameters: True: one set of parameters for all agents; False: one for each; or the number of each agent's
+            set, as a sequence or a mapping.
+        agent_ids: let the network know each agent's number, as a one-hot.
+        device: where the network is built, by default the specs' device; a module that is handed in stays where it is.
     """
-    layers, features = trunk(env, hidden, activation, normalizer, encoder)
-    head = GaussianHead(features, action_size(env), log_std)
-    return probabilistic(headed(layers, head, ["loc", "scale"]), ["loc", "scale"], IndependentNormal)
+    who = agents(env, group, share_parameters, agent_ids, device)
+    body = trunk(who, hidden, activation, normalizer, encoder)
+    head = GaussianHead(who, body.features, box_action(who.action()).shape[0], log_std)
+    return probabilistic(who, body, head, ["loc", "scale"], IndependentNormal)
 
 
 def tanh_normal_actor(
@@ -55,6 +67,10 @@ def tanh_normal_actor(
     tanh_loc: bool = False,
     normalizer: nn.Module | None = None,
     encoder: nn.Module | None = None,
+    group: str | None = None,
+    share_parameters: Share = True,
+    agent_ids: bool = False,
+    device: torch.device | str | None = None,
 ) -> ProbabilisticActor:
     """A Gaussian squashed by tanh into the action's bounds, mean and standard deviation both of the state (SAC's).
 
@@ -66,17 +82,17 @@ def tanh_normal_actor(
         env: any TorchRL environment with a bounded continuous action.
         log_std_bounds: the log standard deviation is squashed into this range.
         tanh_loc: bound the mean before the tanh.
-        hidden, activation, normalizer, encoder: as in :func:`gaussian_actor`.
+        hidden, activation, normalizer, encoder, group, share_parameters, agent_ids, device: as in
+            :func:`gaussian_actor`.
     """
-    space: Any = box_action(env, needs_bounds=True).space
-    layers, features = trunk(env, hidden, activation, normalizer, encoder)
-    head = StateDependentHead(features, action_size(env), log_std_bounds, loc_bound=5.0 if tanh_loc else None)
-    kwargs = {
-        "low": space.low,
-        "high": space.high,
-        "event_dims": 1,
-    }  # its own tanh_loc moves the mean by the bounds' middle
-    return probabilistic(headed(layers, head, ["loc", "scale"]), ["loc", "scale"], TanhNormal, kwargs)
+    who = agents(env, group, share_parameters, agent_ids, device)
+    spec = box_action(who.action(), needs_bounds=True)
+    body, space = trunk(who, hidden, activation, normalizer, encoder), cast(Any, spec.space)
+    linear = who.linear(body.features, 2 * spec.shape[0])
+    head = StateDependentHead(linear, log_std_bounds, loc_bound=5.0 if tanh_loc else None)
+    bounds = {"low": space.low.to(who.device), "high": space.high.to(who.device)}
+    kwargs = {**bounds, "event_dims": 1}  # its own tanh_loc moves the mean by the bounds' middle
+    return probabilistic(who, body, head, ["loc", "scale"], TanhNormal, kwargs)
 
 
 def actor(
@@ -89,6 +105,10 @@ def actor(
     distribution_kwargs: Mapping[str, Any] | None = None,
     normalizer: nn.Module | None = None,
     encoder: nn.Module | None = None,
+    group: str | None = None,
+    share_parameters: Share = True,
+    agent_ids: bool = False,
+    device: torch.device | str | None = None,
 ) -> ProbabilisticActor:
     """An actor with any distribution over a continuous action, whose parameters are raw outputs of one linear head.
 
@@ -99,36 +119,48 @@ def actor(
             mean, for evaluation.
         parameters: names, each of the action's size; or a mapping from names to shapes of one state's parameters.
         distribution_kwargs: settings that do not depend on the state.
-        hidden, activation, normalizer, encoder: as in :func:`gaussian_actor`.
+        hidden, activation, normalizer, encoder, group, share_parameters, agent_ids, device: as in
+            :func:`gaussian_actor`.
     """
-    size = action_size(env)
+    who = agents(env, group, share_parameters, agent_ids, device)
+    size = box_action(who.action()).shape[0]
     shapes = parameters if isinstance(parameters, Mapping) else {name: (size,) for name in parameters}
-    layers, features = trunk(env, hidden, activation, normalizer, encoder)
-    net = headed(layers, SplitHead(features, list(shapes.values())), list(shapes))
-    return probabilistic(net, list(shapes), distribution, dict(distribution_kwargs or {}))
+    body = trunk(who, hidden, activation, normalizer, encoder)
+    head = SplitHead(who, body.features, list(shapes.values()))
+    return probabilistic(who, body, head, list(shapes), distribution, dict(distribution_kwargs or {}))
 
 
 class GaussianHead(nn.Module):
-    """Linear mean and a state-independent ``log_std`` parameter: ``[*B, features] -> 2 x [*B, actions]``."""
+    """Linear mean and a state-independent ``log_std`` parameter: ``[*B, features] -> 2 x [*B, actions]``.
 
-    def __init__(self, features: int, actions: int, log_std: float) -> None:
+    ``log_std`` is ``[actions]``; of a group with several sets of parameters, ``[sets, actions]``.
+    """
+
+    def __init__(self, who: Agents, features: int, actions: int, log_std: float) -> None:
         super().__init__()
-        self.mean = orthogonal(nn.Linear(features, actions), 0.01)
-        self.log_std = nn.Parameter(torch.full((actions,), float(log_std)))
+        self.mean = who.linear(features, actions, 0.01)
+        self.sets = list(who.sets) if who.several else None
+        shape = (max(who.sets) + 1, actions) if who.several else (actions,)
+        self.log_std = nn.Parameter(torch.full(shape, float(log_std), device=who.device))
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        loc = self.mean(x)
-        return loc, self.log_std.exp().expand_as(loc)
+        loc, scale = self.mean(x), self.log_std.exp()
+        scale = scale if self.sets is None else torch.stack([scale[i] for i in self.sets])
+        return loc, scale.expand_as(loc)
 
 
 class StateDependentHead(nn.Module):
-    """Linear mean and log standard deviation within bounds: ``[*B, features] -> 2 x [*B, actions]``."""
+    """Mean and log standard deviation within bounds: ``[*B, features] -> 2 x [*B, actions]``.
 
-    def __init__(
-        self, features: int, actions: int, log_std_bounds: tuple[float, float], loc_bound: float | None = None
-    ) -> None:
+    Args:
+        linear: ``[*B, features] -> [*B, 2 * actions]``.
+        log_std_bounds: the log standard deviation is squashed into this range.
+        loc_bound: the mean is squashed into minus this to this.
+    """
+
+    def __init__(self, linear: nn.Module, log_std_bounds: tuple[float, float], loc_bound: float | None = None) -> None:
         super().__init__()
-        self.linear = nn.Linear(features, 2 * actions)
+        self.linear = linear
         (self.low, self.high), self.loc_bound = log_std_bounds, loc_bound
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
@@ -140,10 +172,10 @@ class StateDependentHead(nn.Module):
 class SplitHead(nn.Module):
     """One linear layer whose output is cut into several: ``[*B, features] -> [*B, *shape]`` for each shape."""
 
-    def __init__(self, features: int, shapes: Sequence[Sequence[int]]) -> None:
+    def __init__(self, who: Agents, features: int, shapes: Sequence[Sequence[int]]) -> None:
         super().__init__()
         self.shapes = [tuple(shape) for shape in shapes]
-        self.linear = orthogonal(nn.Linear(features, sum(map(prod, self.shapes))), 0.01)
+        self.linear = who.linear(features, sum(map(prod, self.shapes)), 0.01)
 
     def forward(self, x: Tensor) -> tuple[Tensor, ...]:
         parts = self.linear(x).split([prod(shape) for shape in self.shapes], -1)
@@ -151,15 +183,20 @@ class SplitHead(nn.Module):
 
 
 def probabilistic(
-    net: TensorDictModule,
+    who: Agents,
+    body: Trunk,
+    head: nn.Module,
     parameters: Sequence[str],
     distribution: Callable[..., Distribution],
     kwargs: dict[str, Any] | None = None,
+    head_keys: Sequence[NestedKey] = (),
 ) -> ProbabilisticActor:
     """TorchRL's ``ProbabilisticActor`` of a network that writes the distribution's parameters."""
+    keys = [who.key(name) for name in parameters]
     return ProbabilisticActor(
-        net,
-        in_keys=[*parameters],
+        headed(body, head, keys, head_keys),
+        in_keys=keys,
+        out_keys=None if who.name is None else [who.key("action")],
         distribution_class=distribution,
         distribution_kwargs=kwargs or {},
         return_log_prob=True,

@@ -9,7 +9,8 @@ from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
 from pgkit.modules.ensemble import EnsembleBatchRenorm, EnsembleDropout, EnsembleLayerNorm, EnsembleLinear
-from pgkit.modules.sizes import layer_sizes, observation_size
+from pgkit.modules.groups import agents
+from pgkit.modules.sizes import flat_size, layer_sizes
 
 Layers = tuple[list[nn.Module], int]
 Body = Callable[[int, int], Layers]
@@ -99,12 +100,17 @@ class Encoder(nn.Module):
     Args:
         env: its observation gives the size of the input.
         body: ``(num, features) -> layers``, e.g. ``partial(modules.simba, width=128, blocks=1)``.
+        group, device: as in :func:`~pgkit.modules.gaussian_actor`; a group's agents share the network.
     """
 
-    def __init__(self, env: EnvBase, body: Body) -> None:
+    def __init__(
+        self, env: EnvBase, body: Body, *, group: str | None = None, device: torch.device | str | None = None
+    ) -> None:
         super().__init__()
-        layers, self.features = body(1, observation_size(env))
-        self.layers = nn.Sequential(*layers)
+        who = agents(env, group, device=device)
+        key = who.key("observation")
+        layers, self.features = body(1, flat_size(who.observation(key).shape, key))
+        self.layers = nn.Sequential(*layers).to(who.device)
 
     def forward(self, x: Tensor) -> Tensor:
         return self.layers(x.reshape(1, -1, x.shape[-1])).reshape(*x.shape[:-1], self.features)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from pgkit.errors import UserError, whole
+from pgkit.errors import UserError, check_whole_number
 from pgkit.modules.tokens import TokenActor, TokenValue, Vocabulary
 
 
@@ -22,7 +22,7 @@ def causal_lm(
         layers, width, heads: blocks, features, attention heads; an even number of features a head.
         temperature: divides the logits, in sampling and in scoring alike.
     """
-    whole(1, layers=layers, width=width, heads=heads)
+    check_whole_number(1, layers=layers, width=width, heads=heads)
     return TokenActor(Transformer(env.vocab_size, env.context, layers, width, heads), env, temperature=temperature)
 
 

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 import torch
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
-from pgkit.modules.mlp import orthogonal
-from pgkit.modules.sizes import action_size, box_action
+from pgkit.modules.groups import Share, agents
+from pgkit.modules.sizes import box_action
 from pgkit.modules.trunk import headed, trunk
 
 
@@ -22,6 +22,10 @@ def deterministic_actor(
     *,
     normalizer: nn.Module | None = None,
     encoder: nn.Module | None = None,
+    group: str | None = None,
+    share_parameters: Share = True,
+    agent_ids: bool = False,
+    device: torch.device | str | None = None,
 ) -> TensorDictModule:
     """One action a state, squashed by tanh into the action's bounds: ``observation [*B, obs] -> action [*B, actions]``.
 
@@ -30,12 +34,15 @@ def deterministic_actor(
 
     Args:
         env: any TorchRL environment with a bounded continuous action.
-        hidden, activation, normalizer, encoder: as in :func:`~pgkit.modules.gaussian_actor`.
+        hidden, activation, normalizer, encoder, group, share_parameters, agent_ids, device: as in
+            :func:`~pgkit.modules.gaussian_actor`.
     """
-    space: Any = box_action(env, needs_bounds=True).space
-    layers, features = trunk(env, hidden, activation, normalizer, encoder)
-    head = orthogonal(nn.Linear(features, action_size(env)), 0.01)
-    return headed(layers, nn.Sequential(head, Squash(space.low, space.high)), ["action"])
+    who = agents(env, group, share_parameters, agent_ids, device)
+    spec = box_action(who.action(), needs_bounds=True)
+    body, space = trunk(who, hidden, activation, normalizer, encoder), cast(Any, spec.space)
+    head = who.linear(body.features, spec.shape[0], 0.01)
+    squash = Squash(space.low, space.high).to(who.device)
+    return headed(body, nn.Sequential(head, squash), [who.key("action")])
 
 
 class Squash(nn.Module):

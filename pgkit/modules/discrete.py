@@ -14,8 +14,8 @@ from torchrl.modules import OneHotCategorical, ProbabilisticActor
 
 from pgkit.errors import UserError
 from pgkit.modules.actors import probabilistic
-from pgkit.modules.mlp import orthogonal
-from pgkit.modules.trunk import headed, trunk
+from pgkit.modules.groups import Share, agents
+from pgkit.modules.trunk import trunk
 
 
 def categorical_actor(
@@ -25,15 +25,21 @@ def categorical_actor(
     *,
     normalizer: nn.Module | None = None,
     encoder: nn.Module | None = None,
+    group: str | None = None,
+    share_parameters: Share = True,
+    agent_ids: bool = False,
+    device: torch.device | str | None = None,
 ) -> ProbabilisticActor:
     """A categorical distribution over discrete actions; over MultiDiscrete ones, the product of one for each choice.
 
     The action is an index where the spec is TorchRL's ``Categorical`` (pgkit's environments), one-hot where it is
     ``OneHot`` (TorchRL's ``GymEnv`` by default). Where the environment observes an ``action_mask`` (boolean
     ``[n]``, for MultiDiscrete the masks of all choices side by side), actions that it forbids have probability 0, and
-    their logits no gradient. Arguments as in :func:`gaussian_actor`.
+    their logits no gradient; a state that forbids all of them has the uniform distribution. Arguments as in
+    :func:`gaussian_actor`.
     """
-    spec: Any = env.action_spec_unbatched
+    who = agents(env, group, share_parameters, agent_ids, device)
+    spec: Any = who.action()
     several = isinstance(spec, MultiCategoricalSpec)
     if spec.dtype.is_floating_point or not (several or hasattr(spec.space, "n")):
         raise UserError(
@@ -41,15 +47,12 @@ def categorical_actor(
             "use modules.gaussian_actor or modules.tanh_normal_actor"
         )
     choices = [int(n) for n in spec.nvec.flatten()] if several else [int(spec.space.n)]
-    layers, features = trunk(env, hidden, activation, normalizer, encoder)
-    head = orthogonal(nn.Linear(features, sum(choices)), 0.01)
-    if "action_mask" in env.observation_spec.keys():
-        net = headed(layers, MaskedHead(head), ["logits"], ["action_mask"])
-    else:
-        net = headed(layers, head, ["logits"])
-    if several:
-        return probabilistic(net, ["logits"], MultiCategorical, {"choices": choices})
-    return probabilistic(net, ["logits"], OneHotCategorical if spec.shape else Categorical)
+    body = trunk(who, hidden, activation, normalizer, encoder)
+    head, mask = who.linear(body.features, sum(choices), 0.01), who.key("action_mask")
+    masks = [mask] if mask in env.observation_spec.keys(True) else []
+    distribution = MultiCategorical if several else OneHotCategorical if spec.shape else Categorical
+    kwargs = {"choices": choices} if several else {}
+    return probabilistic(who, body, MaskedHead(head) if masks else head, ["logits"], distribution, kwargs, masks)
 
 
 class Categorical(distributions.Categorical):

@@ -7,11 +7,13 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, exploration_type
 
-from pgkit.modules.sizes import action_size, box_action
+from pgkit.modules.groups import agents
+from pgkit.modules.sizes import box_action
 
 
 class GaussianExploration(TensorDictModuleBase):
@@ -23,23 +25,26 @@ class GaussianExploration(TensorDictModuleBase):
 
     Args:
         actor: writes ``action``; :func:`~pgkit.modules.deterministic_actor`.
-        env: the bounds come from its specs.
+        env: the bounds come from its specs; with many agents, those of ``group``.
         std: :math:`\sigma`; the buffer ``std`` may be changed while training.
     """
 
     std: Tensor
 
-    def __init__(self, actor: TensorDictModuleBase, env: EnvBase, std: float = 0.1) -> None:
+    def __init__(
+        self, actor: TensorDictModuleBase, env: EnvBase, std: float = 0.1, *, group: str | None = None
+    ) -> None:
         super().__init__()
-        self.actor, self.bounds = actor, ActionBounds(env)
+        self.actor, self.bounds = actor, ActionBounds(env, group)
         self.in_keys, self.out_keys = list(actor.in_keys), list(actor.out_keys)
-        self.register_buffer("std", torch.tensor(float(std)))
+        self.register_buffer("std", torch.tensor(float(std), device=self.bounds.low.device))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The actor's result, with noise on its ``action``."""
         out = self.actor(tensordict)
         if explores():
-            out["action"] = self.bounds(out["action"], self.std * torch.randn_like(out["action"]))
+            action = out[self.bounds.key]
+            out[self.bounds.key] = self.bounds(action, self.std * torch.randn_like(action))
         return out
 
 
@@ -57,28 +62,40 @@ class OrnsteinUhlenbeck(TensorDictModuleBase):
 
     Args:
         actor: writes ``action``; not recurrent itself.
-        env: the bounds come from its specs.
+        env: the bounds come from its specs; with many agents, those of ``group``.
         std: :math:`\sigma`; the buffer ``std`` may be changed while training.
         theta: :math:`\theta`, how fast the noise is forgotten; 1 makes it independent.
     """
 
     std: Tensor
 
-    def __init__(self, actor: TensorDictModuleBase, env: EnvBase, std: float = 0.2, theta: float = 0.15) -> None:
+    def __init__(
+        self,
+        actor: TensorDictModuleBase,
+        env: EnvBase,
+        std: float = 0.2,
+        theta: float = 0.15,
+        *,
+        group: str | None = None,
+    ) -> None:
         super().__init__()
-        self.actor, self.bounds, self.theta, self.state_size = actor, ActionBounds(env), theta, action_size(env)
-        self.in_keys = [*actor.in_keys, "is_init", "recurrent_state"]
-        self.out_keys = [*actor.out_keys, ("next", "recurrent_state")]
-        self.register_buffer("std", torch.tensor(float(std)))
+        self.actor, self.bounds, self.theta = actor, ActionBounds(env, group), theta
+        self.state_shape, self.state_size = self.bounds.shape, self.bounds.shape[-1]
+        self.state_key: NestedKey = (*self.bounds.group, "recurrent_state")
+        self._next_key: NestedKey = ("next", *self.state_key)
+        self.in_keys = [*actor.in_keys, "is_init", self.state_key]
+        self.out_keys = [*actor.out_keys, self._next_key]
+        self.register_buffer("std", torch.tensor(float(std), device=self.bounds.low.device))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The actor's result, with noise on its ``action`` and the noise's next state."""
         out = self.actor(tensordict)
         if explores():
-            before = tensordict["recurrent_state"].masked_fill(tensordict["is_init"], 0.0)
-            noise = (1 - self.theta) * before + self.std * torch.randn_like(before)
-            out["action"] = self.bounds(out["action"], noise)
-            out["next", "recurrent_state"] = noise
+            before, begins = tensordict[self.state_key], tensordict["is_init"]
+            begins = begins.reshape(*begins.shape, *[1] * (before.dim() - begins.dim()))
+            noise = (1 - self.theta) * before.masked_fill(begins, 0.0) + self.std * torch.randn_like(before)
+            out[self.bounds.key] = self.bounds(out[self.bounds.key], noise)
+            out[self._next_key] = noise
         return out
 
 
@@ -89,9 +106,13 @@ class ActionBounds(nn.Module):
     high: Tensor
     half_range: Tensor
 
-    def __init__(self, env: EnvBase) -> None:
+    def __init__(self, env: EnvBase, group: str | None = None) -> None:
         super().__init__()
-        space: Any = box_action(env, needs_bounds=True).space
+        who = agents(env, group)
+        spec = box_action(who.action(), needs_bounds=True)
+        space: Any = spec.space
+        self.group = () if who.name is None else (who.name,)
+        self.key, self.shape = who.key("action"), (*[who.number for _ in self.group], *spec.shape)
         for name, x in (("low", space.low), ("high", space.high), ("half_range", (space.high - space.low) / 2)):
             self.register_buffer(name, x.clone())
 

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import floor
+from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torchrl.envs import EnvBase
 
-from pgkit.modules.sizes import observation_shape
+from pgkit.errors import UserError
+from pgkit.modules.ensemble import EnsembleLinear
+from pgkit.modules.groups import agents
 
 
 class RunningMoments(nn.Module):
@@ -18,16 +21,27 @@ class RunningMoments(nn.Module):
     var: Tensor
     count: Tensor
 
-    def __init__(self, shape: Sequence[int]) -> None:
+    def __init__(self, shape: Sequence[int], device: torch.device | str | None = None) -> None:
         super().__init__()
-        self.register_buffer("mean", torch.zeros(tuple(shape)))
-        self.register_buffer("var", torch.ones(tuple(shape)))
-        self.register_buffer("count", torch.zeros((), dtype=torch.float64))
+        self.register_buffer("mean", torch.zeros(tuple(shape), device=device))
+        self.register_buffer("var", torch.ones(tuple(shape), device=device))
+        self.register_buffer("count", torch.zeros((), dtype=torch.float64, device=device))
 
     @torch.no_grad()
-    def update(self, x: Tensor) -> None:
-        """Takes in a batch ``[*B, *shape]``."""
-        x = x.reshape(-1, *self.mean.shape).to(self.mean.dtype)
+    def update(self, x: Tensor, mask: Tensor | None = None) -> None:
+        """Takes in a batch ``[*B, *shape]``, of it the rows where ``mask [*B]`` is True."""
+        if mask is not None:
+            if mask.shape != x.shape[: mask.dim()] or mask.dim() > x.dim() - self.mean.dim():
+                raise UserError(
+                    f"a mask of shape {tuple(mask.shape)} does not choose among samples of {tuple(x.shape)}"
+                )
+            x = x[mask]
+        x = x.reshape(-1, *self.mean.shape)
+        if len(x):
+            self._take(x.to(self.mean.dtype))
+
+    def _take(self, x: Tensor) -> None:
+        """Takes in samples ``[n, *shape]``."""
         total = self.count + len(x)
         weight = (len(x) / total).to(x.dtype)  # of the new samples
         delta = x.mean(0) - self.mean
@@ -38,20 +52,72 @@ class RunningMoments(nn.Module):
 
 
 class ObsNormalizer(RunningMoments):
-    """Normalizes observations: ``(x - mean) / std``, clamped to ``[-clip, clip]``. Identity before the first update.
+    r"""Normalizes observations: ``(x - mean) / std``, clamped to ``[-clip, clip]``. Identity before the first update.
+
+    For entries that vary from sample to sample and have no outliers, ``mean`` and ``std`` are those of all samples.
+    Two rules keep the others useful:
+
+    - **Outliers.** A sample enters the moments as what the network sees of it: no further than ``clip`` deviations from
+      the mean. The first update has no deviation yet; it takes the batch's median, and as deviation the distance that
+      nine in ten samples keep, divided by 1.645 as for a Gaussian (1 where nine in ten are equal).
+    - **Entries that rest** at one value, the first batch's median, and leave it rarely: contact forces, flags. Where a
+      share :math:`p` below 1/4 leaves it, the deviation is the one that a quarter would have, so that the rare values
+      come out near 2 and not at :math:`1 / \sqrt p`: :math:`\sigma^2 = \text{var} \cdot \max(1, 1 / (4 p))`.
+      An entry that never left it is not scaled, :math:`\sigma = 1`.
 
     Args:
         env: an environment whose ``observation_spec`` has the entry ``observation``, or the shape itself.
         clip: bound of the result.
+        group: a group of agents, whose observations share mean and deviation; found by itself if it is the only one.
+        device: where it lives; by default the specs' device.
     """
 
-    def __init__(self, env: EnvBase | Sequence[int], clip: float = 10.0) -> None:
-        super().__init__(observation_shape(env) if isinstance(env, EnvBase) else env)
+    rest: Tensor
+    moved: Tensor
+    spread: Tensor
+
+    def __init__(
+        self,
+        env: Any,
+        clip: float = 10.0,
+        *,
+        group: str | None = None,
+        device: torch.device | str | None = None,
+    ) -> None:
+        given = isinstance(env, Sequence)  # a shape
+        who = None if given else agents(env, group, device=device)
+        shape = env if who is None else who.observation(who.key("observation")).shape
+        super().__init__(shape, device if who is None else who.device)
         self.clip = clip
+        self.register_buffer("rest", torch.zeros_like(self.mean))
+        self.register_buffer("moved", torch.zeros_like(self.mean, dtype=torch.float64))  # samples that do not rest
+        self.register_buffer("spread", torch.ones_like(self.mean))  # the deviation squared
 
     def forward(self, x: Tensor) -> Tensor:
         """``[*B, *shape]`` to the same shape."""
-        return ((x - self.mean) * (self.var + 1e-8).rsqrt()).clamp(-self.clip, self.clip)
+        return ((x - self.mean) * (self.spread + 1e-8).rsqrt()).clamp(-self.clip, self.clip)
+
+    def _take(self, x: Tensor) -> None:
+        if self.count > 0:
+            middle, deviation = self.mean, self.spread.sqrt()
+        else:
+            self.rest.copy_(_order(x, 0.5))  # median() is wrong on expanded tensors
+            middle, deviation = self.rest, _typical_distance(x - self.rest)
+        self.moved.add_((x != self.rest).sum(0))
+        super()._take(x.clamp(middle - self.clip * deviation, middle + self.clip * deviation))
+        rarity = (self.count / (4 * self.moved)).clamp_min(1).to(self.var.dtype)
+        self.spread.copy_(torch.where(self.moved > 0, self.var * rarity, 1.0))
+
+
+def _order(x: Tensor, share: float) -> Tensor:
+    """The sample of ``x [n, ...]`` that this share of the others does not exceed."""
+    return x.kthvalue(floor(share * (len(x) - 1)) + 1, 0).values
+
+
+def _typical_distance(x: Tensor) -> Tensor:
+    """The size that nine in ten of ``x [n, ...]`` do not exceed, over 1.645; 1 where that is 0."""
+    size = _order(x.abs(), 0.9)
+    return torch.where(size > 0, size / 1.645, 1.0)
 
 
 class ReturnScale(RunningMoments):
@@ -59,27 +125,42 @@ class ReturnScale(RunningMoments):
 
     Give it to :class:`pgkit.advantages.GAE` (``return_scale=``): the critic's output is then in units of
     :attr:`scale`, the advantage stays in the rewards' unit. Call :meth:`update` once a rollout.
+
+    Args:
+        shape: ``()``, one scale for all; ``(agents, 1)``, one for each agent of a group.
+        device: where it lives.
     """
 
-    def __init__(self) -> None:
-        super().__init__(())
+    def __init__(self, shape: Sequence[int] = (), *, device: torch.device | str | None = None) -> None:
+        super().__init__(shape, device)
 
     @property
     def scale(self) -> Tensor:
-        """Standard deviation of the returns, a scalar; 1 before the first update."""
+        """Standard deviation of the returns, a scalar or of the shape; 1 before the first update."""
         return (self.var + 1e-8).sqrt()
 
     @torch.no_grad()
-    def update(self, x: Tensor, critic: nn.Module | None = None) -> None:
-        """Takes in the ``value_target`` that GAE wrote with this scale, any shape.
+    def update(self, x: Tensor, critic: nn.Module | None = None, mask: Tensor | None = None) -> None:
+        """Takes in the ``value_target`` that GAE wrote with this scale, ``[*B, *shape]``, where ``mask`` is True.
 
         With ``critic``, its last linear layer is rescaled so that its values in the rewards' unit stay (van Hasselt et
         al., 2016, https://arxiv.org/abs/1602.07714). Short rollouts need it: their targets are mostly the critic's own
         values, so a scale that changes them feeds itself.
+
+        Raises:
+            UserError: a scale for each agent, and a critic whose last layer all agents share.
         """
         before = self.scale
-        super().update(x * before)
+        super().update(x * before, mask)
         if critic is not None:
-            head = [module for module in critic.modules() if isinstance(module, nn.Linear)][-1]
+            head = [module for module in critic.modules() if isinstance(module, nn.Linear | EnsembleLinear)][-1]
+            factor = before / self.scale
+            if factor.numel() > 1:
+                if not isinstance(head, EnsembleLinear) or len(head.weight) != factor.numel():
+                    raise UserError(
+                        f"the scale has {factor.numel()} agents, the critic's last layer is one for all of them: use "
+                        "ReturnScale() with it, or state_value(..., share_parameters=False)"
+                    )
+                factor = factor.reshape(-1, 1, 1)
             for parameter in head.parameters():
-                parameter.mul_(before / self.scale)
+                parameter.mul_(factor)

@@ -9,7 +9,9 @@ import torch
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
-from pgkit.modules.trunk import reads, trunk
+from pgkit.modules.groups import Agents, Share, agents
+from pgkit.modules.mlp import Linear
+from pgkit.modules.trunk import Trunk, trunk
 
 
 def gru(
@@ -20,6 +22,10 @@ def gru(
     *,
     normalizer: nn.Module | None = None,
     encoder: nn.Module | None = None,
+    group: str | None = None,
+    share_parameters: Share = True,
+    agent_ids: bool = False,
+    device: torch.device | str | None = None,
 ) -> Recurrent:
     """A gated recurrent unit over the features of an encoder (Cho et al., 2014, https://arxiv.org/abs/1406.1078).
 
@@ -29,10 +35,12 @@ def gru(
     Args:
         env: any environment of pgkit.
         size: size of the state.
-        hidden, activation, normalizer, encoder: what comes before it, as in :func:`gaussian_actor`.
+        hidden, activation, normalizer, encoder, group, share_parameters, agent_ids, device: what comes before it, as in
+            :func:`gaussian_actor`. Of a group every agent has a state, ``("agents", "recurrent_state")``.
     """
-    layers, features = trunk(env, hidden, activation, normalizer, encoder)
-    return Recurrent(layers, GRUCell(features, size))
+    who = agents(env, group, share_parameters, agent_ids, device)
+    body = trunk(who, hidden, activation, normalizer, encoder)
+    return Recurrent(body, GRUCell(body.features, size, who.linear), who)
 
 
 def lstm(
@@ -43,10 +51,19 @@ def lstm(
     *,
     normalizer: nn.Module | None = None,
     encoder: nn.Module | None = None,
+    group: str | None = None,
+    share_parameters: Share = True,
+    agent_ids: bool = False,
+    device: torch.device | str | None = None,
 ) -> Recurrent:
     """Long short-term memory (Hochreiter and Schmidhuber, 1997); otherwise as :func:`gru`."""
-    layers, features = trunk(env, hidden, activation, normalizer, encoder)
-    return Recurrent(layers, LSTMCell(features, size))
+    who = agents(env, group, share_parameters, agent_ids, device)
+    body = trunk(who, hidden, activation, normalizer, encoder)
+    return Recurrent(body, LSTMCell(body.features, size, who.linear), who)
+
+
+def _linear(inputs: int, outputs: int, gain: float | None = None) -> nn.Module:
+    return nn.Linear(inputs, outputs)
 
 
 class GRUCell(nn.Module):
@@ -57,10 +74,10 @@ class GRUCell(nn.Module):
         h' = n + z (h - n)
     """
 
-    def __init__(self, features: int, size: int) -> None:
+    def __init__(self, features: int, size: int, linear: Linear = _linear) -> None:
         super().__init__()
         self.size = self.state_size = size
-        self.input, self.recurrent = nn.Linear(features, 3 * size), nn.Linear(size, 3 * size)
+        self.input, self.recurrent = linear(features, 3 * size, None), linear(size, 3 * size, None)
 
     def forward(self, given: Tensor, state: Tensor) -> Tensor:
         ir, iz, i_new = given.chunk(3, -1)
@@ -76,10 +93,10 @@ class LSTMCell(nn.Module):
         c' = \sigma(a_f) c + \sigma(a_i) \tanh(a_c), \quad h' = \sigma(a_o) \tanh(c')
     """
 
-    def __init__(self, features: int, size: int) -> None:
+    def __init__(self, features: int, size: int, linear: Linear = _linear) -> None:
         super().__init__()
         self.size, self.state_size = size, 2 * size
-        self.input, self.recurrent = nn.Linear(features, 4 * size), nn.Linear(size, 4 * size)
+        self.input, self.recurrent = linear(features, 4 * size, None), linear(size, 4 * size, None)
 
     def forward(self, given: Tensor, state: Tensor) -> Tensor:
         hidden, cell = state.chunk(2, -1)
@@ -97,15 +114,24 @@ class Recurrent(nn.Module):
       before;
     - sequences: ``is_init [B, L, 1]``, of ``recurrent_state [B, L, state_size]`` only the first step is read.
 
-    Returns features ``[..., size]`` and the state after each step ``[..., state_size]``.
+    Returns features ``[..., size]`` and the state after each step ``[..., state_size]``. Of a group, observations,
+    features and states have a dimension of agents before the last, ``("agents", "recurrent_state") [N, agents, size]``;
+    ``is_init`` is the environment's.
+
+    Attributes:
+        state_size: numbers in one state.
+        state_shape: shape of an environment's states, ``(state_size,)`` or ``(agents, state_size)``.
+        state_key: ``recurrent_state``, of a group below its name.
     """
 
-    def __init__(self, layers: Sequence[nn.Module], cell: Any) -> None:
+    def __init__(self, body: Trunk, cell: Any, who: Agents) -> None:
         super().__init__()
-        self.in_keys = [*reads(layers[-1]), "is_init", "recurrent_state"]
-        self.out_keys = [("next", "recurrent_state")]
-        self.encoder = layers[0] if len(layers) == 1 else nn.Sequential(*layers)
+        self.state_key = who.key("recurrent_state")
+        self.in_keys = [*body.keys, "is_init", self.state_key]
+        self.out_keys = [("next", *(["recurrent_state"] if who.name is None else [who.name, "recurrent_state"]))]
+        self.encoder = body.layers[0] if len(body.layers) == 1 else nn.Sequential(*body.layers)
         self.cell, self.state_size = cell, cell.state_size
+        self.state_shape = (*([] if who.name is None else [who.number]), cell.state_size)
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
         *entries, is_init, state = inputs
@@ -114,6 +140,7 @@ class Recurrent(nn.Module):
             entries = [x.unsqueeze(1) for x in entries]
             is_init, state = is_init.unsqueeze(1), state.unsqueeze(1)
         rows, steps = is_init.shape[:2]
+        is_init = is_init.reshape(rows, steps, *[1] * len(self.state_shape))
         features = self.encoder(*(x.flatten(0, 1) for x in entries))
         given = self.cell.input(features).unflatten(0, (rows, steps))
         state, states = state[:, 0], []

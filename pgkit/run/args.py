@@ -5,8 +5,6 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import math
-import os
-import sys
 import types
 import typing
 from collections.abc import Callable
@@ -20,6 +18,7 @@ import torch
 import tyro
 
 from pgkit import envs
+from pgkit.cli.beside import look_in
 from pgkit.errors import UserError
 
 
@@ -90,13 +89,12 @@ class RunArgs:
 
     def make_env(self, num_envs: int, seed: int, workers: int = 1) -> envs.VectorEnv:
         """The environment of these settings; a recipe with another kind of environment overrides this."""
-        if self.imports():
-            allow_imports_from_here()
-        make, keywords = self.env_id, dict(self.env)
-        if self.wrapper is not None:
+        make, keywords, here = self.env_id, dict(self.env), Path.cwd()
+        modules = [name.split()[1].partition(":")[0] for name in self.imports()]
+        if self.wrapper is not None or any([look_in(here, module) for module in modules]):
             by_gymnasium = not self.env_id.startswith(("dm_control/", "dmc:"))
             inside = {k: keywords.pop(k) for k in ("max_episode_steps",) if by_gymnasium and k in keywords}
-            make = partial(wrapped, self.env_id, imported(self.wrapper), **inside)
+            make = partial(made_here, self.env_id, self.wrapper, modules, here, **inside)
             vars(make)["__qualname__"] = self.env_id  # the name that messages and the replay use
         keywords |= {"num_envs": num_envs, "seed": seed, "workers": workers, "action_repeat": self.action_repeat}
         return envs.make(make, **keywords)
@@ -119,12 +117,6 @@ def placed(args: RunArgs) -> torch.device:
     return torch.device("cuda" if args.device != "cpu" and torch.cuda.is_available() else "cpu")
 
 
-def allow_imports_from_here() -> None:
-    """Modules of the working directory can be imported; last on the path, they hide no other."""
-    if (here := os.getcwd()) not in sys.path:
-        sys.path.append(here)
-
-
 def imported(name: str) -> Callable[[gym.Env], gym.Env]:
     """The function ``module:function``.
 
@@ -145,9 +137,12 @@ def imported(name: str) -> Callable[[gym.Env], gym.Env]:
     return found
 
 
-def wrapped(env_id: str, wrapper: Callable[[gym.Env], gym.Env], **kwargs: Any) -> gym.Env:
-    """One wrapped environment."""
-    return wrapper(envs.make_one(env_id, **kwargs))
+def made_here(env_id: str, wrapper: str | None, modules: list[str], here: Path, **kwargs: Any) -> gym.Env:
+    """One environment, of modules that may lie in the folder ``here``; in worker processes, too."""
+    for module in modules:
+        look_in(here, module)
+    env = envs.make_one(env_id, **kwargs)
+    return env if wrapper is None else imported(wrapper)(env)
 
 
 def told(args_class: type[RunArgs], name: str) -> dict[str, Any]:

@@ -24,14 +24,12 @@ from pgkit.run.args import RunArgs, free_on_resume, of_type
 
 A = TypeVar("A", bound=RunArgs)
 PACKAGES = ("pgkit", "torch", "torchrl", "tensordict", "numpy", "gymnasium", "mujoco", "dm-control", "shimmy")
-_SHAPE = {"settings": dict, "command": list, "resumed_at": list, "id": str, "may_change": list}
+_TEXT = (str, type(None))
+_KINDS = {"settings": dict, "command": list, "resumed_at": list, "id": str, "may_change": list, "file": _TEXT}
 
 
 def write_config(path: Path, args: RunArgs, recipe: str, before: dict[str, Any] | None, identity: str) -> None:
-    """Write ``config.json``; ``before`` is that of the run that goes on, with the frames of each resume.
-
-    A new run claims the directory by creating the file; if another run got there first this is a UserError.
-    """
+    """Write ``config.json``; ``before`` is that of the run that goes on, with the frames of each resume."""
     config = {
         "recipe": recipe,
         "file": recipe_file(type(args)),
@@ -44,28 +42,23 @@ def write_config(path: Path, args: RunArgs, recipe: str, before: dict[str, Any] 
         "resumed_at": before["resumed_at"] if before else [],
         "id": identity,
     }
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-        if before is None:
-            (path / "config.json").touch(exist_ok=False)
-    except FileExistsError:
-        raise UserError(f"{path} already holds a run: give another --run-dir") from None
-    except OSError as error:
-        raise UserError(f"--run-dir {path} cannot be made: {error.strerror}") from error
     write_json(path / "config.json", config)
 
 
 def read_config(path: Path) -> dict[str, Any]:
     """``config.json`` of a run directory; a UserError if there is none, or if it is damaged."""
     file = path / "config.json"
-    if not file.is_file():
-        raise UserError(f"{path} is not a run directory: it has no config.json")
+    try:
+        if not file.is_file():
+            raise UserError(f"{path} is not a run directory: it has no config.json")
+    except OSError as error:
+        raise UserError(f"{path} is not a run directory: {error.strerror}") from error
     config = read_json(file)
     if not isinstance(config, dict) or not isinstance(config.get("recipe"), str) or "settings" not in config:
         raise UserError(f"{file} is damaged: it names no recipe and settings")
-    for key, kind in _SHAPE.items():
+    for key, kind in _KINDS.items():
         if key in config and not isinstance(config[key], kind):
-            raise UserError(f"{file} is damaged: its {key} is no {kind.__name__}")
+            raise UserError(f"{file} is damaged: its {key} is {config[key]!r:.60}")
     if not isinstance(config["settings"].get("env_id", ""), str):
         raise UserError(f"{file} is damaged: its env_id is no text")
     return config
@@ -108,7 +101,7 @@ def recipe_target(args_class: type[RunArgs], recipe: str = "") -> str:
     """What ``pgkit run`` takes to run this recipe again: its file, or a shipped name."""
     file = recipe_file(args_class)
     if file is None:
-        return recipe or args_class.__module__.rpartition(".")[2]
+        return recipe or Path(vars(sys.modules[args_class.__module__]).get("__file__") or args_class.__module__).stem
     here = Path.cwd()
     return shlex.quote(str(Path(file).relative_to(here) if Path(file).is_relative_to(here) else file))
 

@@ -24,6 +24,12 @@ def choose(args: RunArgs, recipe: str) -> Path:
         return run_of(Path(args.resume))
     name = f"{args.env_id.replace('/', '-')[:100]}__{recipe}__{args.seed}__{time.strftime('%Y%m%d-%H%M%S')}"
     path = Path(args.run_dir or Path("runs") / name)
+    _check_free(path, args, recipe)
+    return path
+
+
+def _check_free(path: Path, args: RunArgs, recipe: str) -> None:
+    """A UserError where the directory holds a run that this one may not take the place of."""
     try:
         if path.exists() and not path.is_dir():
             raise UserError(f"--run-dir {path} is a file; give a directory")
@@ -31,13 +37,26 @@ def choose(args: RunArgs, recipe: str) -> Path:
     except OSError as error:
         raise UserError(f"--run-dir {path!s:.80}...: {error.strerror}") from error
     if held and not _can_start_over(path, args, recipe):
-        way = (
-            f"or go on with it by --resume {path}"
-            if can_resume(path)
-            else "or delete it: it has no checkpoint to go on from"
+        go_on = (
+            f"go on with it by --resume {path}" if can_resume(path) else "delete it: it has no checkpoint to go on from"
         )
-        raise UserError(f"{path} already holds a run: give another --run-dir, {way}")
-    return path
+        raise UserError(f"{path} already holds a run: give another --run-dir, or {go_on}")
+
+
+def claim(path: Path, args: RunArgs, recipe: str) -> int | None:
+    """Makes the directory and takes it for a new run, as :func:`lock`; what a run left that saved nothing goes."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"--run-dir {path} cannot be made: {error.strerror}") from error
+    handle = lock(path)
+    try:
+        _check_free(path, args, recipe)  # again: another run may have come first
+        clear(path)
+    except BaseException:
+        unlock(handle)
+        raise
+    return handle
 
 
 def run_of(path: Path) -> Path:

@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from pgkit.errors import UserError, whole
+from pgkit.errors import UserError, check_whole_number
 from pgkit.run.seeding import preserved_rng
 
 Entries = Mapping[str, torch.Tensor]
@@ -89,7 +89,7 @@ def play(policy: Any, env: Any, episodes: int, deterministic: bool = True) -> tu
         env: has ``.arrays``: ``reset()``, ``step(action)``, ``obs``, ``episode_reward``, ``step_count``.
         deterministic: the likeliest actions, or draws.
     """
-    whole(1, episodes=episodes)
+    check_whole_number(1, episodes=episodes)
     check_playable(env)
     policy = policy if isinstance(policy, torch.nn.Module) else policy.actor
     arrays, act = env.arrays, Acting(policy, getattr(env, "split", None))

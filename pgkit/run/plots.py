@@ -50,7 +50,7 @@ def plot(run_dirs: Sequence[str | Path], out: str | Path, x: Literal["frames", "
                 color=colour, linestyle="--", marker="o", markersize=4, alpha=0.8,
             )  # fmt: skip
         axes.set(title=env_id, xlabel="frames" if x == "frames" else "minutes", ylabel="return of an episode")
-        axes.xaxis.set_major_formatter(_frames)
+        axes.xaxis.set_major_formatter(short_count)
         axes.grid(alpha=0.3)
         if axes.get_legend_handles_labels()[0]:
             axes.legend(frameon=False)
@@ -126,7 +126,7 @@ def _draw(axes: Any, curves: list[Curve], label: str, **style: Any) -> None:
         axes.fill_between(frames, mean - deviation, mean + deviation, color=style["color"], alpha=0.15, linewidth=0)
 
 
-def _frames(value: float, _: int | None) -> str:
+def short_count(value: float, _: int | None) -> str:
     for unit, name in ((1e6, "M"), (1e3, "k")):
         if value >= unit:
             return f"{value / unit:g}{name}"

@@ -5,14 +5,13 @@ from __future__ import annotations
 import logging
 import math
 import secrets
-import shlex
 import signal
 import threading
 import traceback
 from collections import deque
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from statistics import mean, median
+from statistics import mean
 from types import FrameType, TracebackType
 from typing import Any, Protocol, runtime_checkable
 
@@ -22,12 +21,12 @@ from torchrl.envs import EnvBase
 
 from pgkit import files
 from pgkit.errors import Diverged, UserError
-from pgkit.run import checkpoint, config, directory, seeding
+from pgkit.run import checkpoint, config, directory, ending, seeding
 from pgkit.run.agent import Agent
 from pgkit.run.args import RunArgs, check
 from pgkit.run.clock import Clock
 from pgkit.run.evaluate import check_playable, evaluate
-from pgkit.run.metrics import Metrics, averages, column, digest, finished_episodes, read_csv, warm
+from pgkit.run.metrics import Metrics, averages, digest, finished_episodes
 from pgkit.run.plots import plot
 from pgkit.run.progress import Live
 from pgkit.seams import Stateful
@@ -80,8 +79,6 @@ class Run:
         self._lock: int | None = None
 
     def __enter__(self) -> Run:
-        torch.set_num_threads(self.args.threads)
-        seeding.seed_everything(self.args.seed)
         if self.args.resume:
             self._lock = directory.lock(self.dir)  # before it reads: another process may be further
             try:
@@ -89,6 +86,8 @@ class Run:
             except BaseException:
                 directory.unlock(self._lock)
                 raise
+        torch.set_num_threads(self.args.threads)
+        seeding.seed_everything(self.args.seed)
         self._handlers: dict[signal.Signals, Any] = {}
         if threading.current_thread() is threading.main_thread():
             heard = [s for s in SIGNALS if s.name == "SIGINT" or signal.getsignal(s) != signal.SIG_IGN]  # nohup ignores
@@ -102,7 +101,8 @@ class Run:
         config.as_resumed(self.args, self.dir)
         theirs, mine = before.get("file"), config.recipe_file(type(self.args))
         if theirs != mine:
-            _log.warning("%s is a run of %s, this is %s: is it the same?", self.dir, theirs or "pgkit's recipe", mine)
+            names = (file or f"pgkit's {self.recipe}" for file in (theirs, mine))
+            _log.warning("%s is a run of %s, this is %s: is it the same?", self.dir, *names)
         saved = checkpoint.load(resume if resume.suffix == ".pt" else resume / "checkpoints" / "latest.pt")
         if self.args.total_frames <= saved["frames"]:
             if self.args.resume_if_possible:
@@ -174,12 +174,10 @@ class Run:
             folder = self.args.init / "checkpoints"
             path = folder / ("best.pt" if (folder / "best.pt").exists() else "latest.pt")
             checkpoint.restore({"agent": self._agent}, {"agent": checkpoint.load(path)["states"].get("agent")}, path)
-        if not self._saved and directory.holds_run(self.dir):  # and has saved nothing: this run takes its place
-            self._lock = directory.lock(self.dir)
-            directory.clear(self.dir)
+        if not self._saved:
+            self._lock = directory.claim(self.dir, self.args, self.recipe)
+            self._claimed = True
         config.write_config(self.dir, self.args, self.recipe, before, identity)
-        self._claimed = not self._saved
-        self._lock = self._lock if self._lock is not None else directory.lock(self.dir)
         self._metrics = Metrics(self.dir, upto=self.frames, identity=identity)
 
     def step(
@@ -288,7 +286,12 @@ class Run:
             Diverged: a weight is not finite; the checkpoints before stay.
             UserError: the files cannot be written.
         """
+        folder = self.dir / "checkpoints"
         with self._clock.paused():
+            try:
+                folder.mkdir(exist_ok=True)
+            except OSError as error:
+                files.cannot_write(folder, error)
             for part in vars(self._agent).values():
                 if isinstance(part, torch.nn.Module) and not checkpoint.finite(part):
                     raise Diverged(
@@ -308,7 +311,6 @@ class Run:
                     "metrics": digest(self.dir / "metrics.csv", self.frames),
                 },
             }
-            folder = self.dir / "checkpoints"
             if self.best.get("frames") == self.frames:  # first: latest says that there is one
                 files.save(folder / "best.pt", content)
             files.save(folder / "latest.pt", content)
@@ -331,7 +333,7 @@ class Run:
             self._live.close()
             self._close()
         if kind is None or (kind is KeyboardInterrupt and self._saved_at):
-            self._say_how_to_go_on()
+            self._live.line(ending.how_to_go_on(self.dir, self.args, self.recipe, self.frames, bool(self.best)))
         if isinstance(error, SystemExit):
             raise UserError(f"something called sys.exit({error.code}) after {self._seen:,} frames") from error
         if kind is None and self._lost:
@@ -371,36 +373,13 @@ class Run:
 
     def _finish(self) -> None:
         if self._evaluated.get("frames") != self.frames:
-            scores = self._evaluate({})
+            try:
+                scores = self._evaluate({})
+            except BaseException:
+                self.save()
+                raise
             self._metrics.write({"frames": self.frames, "time/wall_s": self._clock.wall, **scores})
         if self._saved_at != self.frames:
             self.save()
-        rows = read_csv(self.dir / "metrics.csv")[1]
-        fps = [value for _, value in column(rows, "time/fps")]
-        returns = column(rows, "rollout/ep_rew_mean")
-        summary = {
-            "recipe": self.recipe,
-            "env_id": self.args.env_id,
-            "seed": self.args.seed,
-            **self._evaluated,
-            "frames": self.frames,
-            "wall_s": self._clock.wall,
-            "time/fps": median(warm(fps)) if fps else NAN,
-            "rollout/ep_rew_mean": returns[-1][1] if returns else NAN,
-            "best/mean_reward": self.best.get("eval/mean_reward", NAN),
-            "best/frames": self.best.get("frames", 0),
-        }
-        config.write_json(self.dir / "summary.json", summary, hashed=False)
+        ending.write_summary(self.dir, self.args, self.recipe, self._clock.wall, self._evaluated, self.best)
         plot([self.dir], self.dir / "curve.png")
-
-    def _say_how_to_go_on(self) -> None:
-        where, target = shlex.quote(str(self.dir)), config.recipe_target(type(self.args), self.recipe)
-        total = self.args.total_frames * (2 if self.frames >= self.args.total_frames else 1)
-        imports = " --trust" if self.args.imports() else ""
-        trust = " --trust" if imports or config.recipe_file(type(self.args)) else ""
-        self._live.line(
-            f"run directory: {self.dir}\n"
-            f"  resume    pgkit run {target} --resume {where} --total-frames {total}{imports}\n"
-            f"  evaluate  pgkit eval {where}{'' if self.best else ' --which latest'}{trust}\n"
-            f"  plot      pgkit plot {where}"
-        )

@@ -1,8 +1,8 @@
 """Updates: one call trains on one rollout or on replayed batches, as one compiled graph a step."""
 
+from pgkit.optim import Together
 from pgkit.updates.off_policy import OffPolicyUpdate
 from pgkit.updates.on_policy import OnPolicyUpdate
-from pgkit.updates.optimizers import Together
 from pgkit.updates.step import GradientStep
 from pgkit.updates.trust_region import TrustRegionUpdate
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -9,15 +11,32 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from pgkit.compiling import check_compile, worth_compiling
+from pgkit import optim
+from pgkit.checks import LossView, assembly, check_settings, diagram, is_loss
+from pgkit.compiled import check_compile, choose, undone
 from pgkit.data import ReplayBuffer
-from pgkit.errors import UserError, whole, within
-from pgkit.updates import optimizers, restoring, wiring
+from pgkit.errors import UserError
+from pgkit.seams import Augmentation
 from pgkit.updates.batches import Batches, OwnBatches, TorchRLBatches
-from pgkit.updates.chain import Chain, is_loss
-from pgkit.updates.diagram import diagram
-from pgkit.updates.step import GradientStep
+from pgkit.updates.minibatches import means
+from pgkit.updates.state import load, save
+from pgkit.updates.step import GradientStep, Grads, grads_of, metrics_of
 from pgkit.updates.targets import averaging, copying
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What the first batch settles.
+
+    Args:
+        every: the step in which every loss joins.
+        critics: the step of the critics' losses alone; the same one where the actor is not delayed.
+        batch: an example.
+    """
+
+    every: GradientStep
+    critics: GradientStep
+    batch: TensorDictBase
 
 
 class OffPolicyUpdate:
@@ -36,8 +55,11 @@ class OffPolicyUpdate:
         actor_delay: the losses other than the critics' join every so many steps (2 in TD3). The critics' are
             ``loss_qvalue``, ``loss_value``, ``loss_critic``, and what trains nothing but their parameters.
         delay_targets: the target networks move only in the steps in which those other losses join, as in TD3.
-        tau: share of the trained parameters that the targets take over at each step.
+        tau: share of the trained parameters that the targets take over at each step; or shares by the names of networks
+            and of modules in them, ``{"qvalue_network": 0.01, "encoder": 0.05}``, of which the innermost holds.
         learning_starts: frames in the replay before the first step, at least ``batch_size``.
+        accumulate: batches whose gradients add up to one optimizer step.
+        augment: ``batch -> batch`` that changes a batch before the loss reads it, inside the compiled step.
         max_grad_norm: bound of the gradient's norm over all parameters; None: no bound.
         total_frames: frames of the whole training, for ``compile="auto"``.
         compile: ``on``, ``off``, or ``auto`` (compile where at least 3,000 steps are expected).
@@ -56,53 +78,29 @@ class OffPolicyUpdate:
         updates_per_step: float = 1.0,
         actor_delay: int = 1,
         delay_targets: bool = False,
-        tau: float = 0.005,
+        tau: float | Mapping[str, float] = 0.005,
         learning_starts: int = 1_000,
+        accumulate: int = 1,
+        augment: Augmentation | None = None,
         max_grad_norm: float | None = None,
         total_frames: int | None = None,
         compile: str = "auto",
     ) -> None:
-        optimizers.check_optimizer(optimizer)
         check_compile(compile)
-        whole(1, batch_size=batch_size, actor_delay=actor_delay)
-        within(0, 1, tau=tau)
-        within(0, float("inf"), updates_per_step=updates_per_step)
-        if not hasattr(buffer, "sample"):
-            raise UserError(
-                f"the update draws from a replay buffer, this is a {type(buffer).__name__}: use data.ReplayBuffer"
-            )
-        if learning_starts < batch_size:
-            raise UserError(
-                f"batch_size={batch_size} is above the learning_starts={learning_starts} frames stored at the first "
-                "update: raise learning_starts or lower batch_size"
-            )
-        own = isinstance(buffer, ReplayBuffer)
-        unfinished = (buffer.n_steps - 1) * buffer.columns if own else 0  # frames whose n-step return is not there yet
-        capacity = buffer.capacity - unfinished if own else buffer.storage.max_size
-        if capacity < learning_starts:
-            raise UserError(
-                f"the replay has at most {capacity:,} frames to draw from and updates begin at learning_starts="
-                f"{learning_starts:,}: raise its capacity (--buffer-size) or lower learning_starts (--random-frames, "
-                "--batch-size)"
-            )
-        if total_frames is not None and total_frames < learning_starts:
-            raise UserError(
-                f"total_frames={total_frames:,} end before updates begin at learning_starts={learning_starts:,}: raise "
-                "the first or lower the second (--random-frames, --batch-size)"
-            )
         self.loss, self.buffer, self.optimizer = loss, buffer, optimizer
         self.batch_size, self.updates_per_step, self.actor_delay = batch_size, updates_per_step, actor_delay
-        self.delay_targets = delay_targets
+        self.delay_targets, self.accumulate, self.augment = delay_targets, accumulate, augment
         self.tau, self.learning_starts, self.max_grad_norm = tau, learning_starts, max_grad_norm
         self.total_frames, self.compile = total_frames, compile
         self.frames = self.updates = 0
+        self.between: Callable[[Grads], Grads] | None = None  # changes the gradients before the optimizer's step
         self._due = 0.0
-        self._batch: TensorDictBase | None = None
+        source = OwnBatches if isinstance(buffer, ReplayBuffer) else TorchRLBatches
+        self._batches: Batches = source(buffer, loss, batch_size * accumulate)
+        one_tau = None if isinstance(tau, Mapping) else tau
+        check_settings(LossView(loss), vars(self) | {"capacity": self._batches.capacity, "tau": one_tau})
         self._average, self._copy_statistics = averaging(loss, tau), copying(loss)
-        self._batches: Batches = (
-            OwnBatches(buffer, loss, batch_size) if own else TorchRLBatches(buffer, loss, batch_size)
-        )
-        self._steps: dict[bool, GradientStep] = {}
+        self._plan: Plan | None = None
 
     def __call__(self, rollout: TensorDictBase) -> dict[str, float]:
         """Stores a rollout ``[num_envs, T]`` and trains; metrics are means over the steps, none if none was due."""
@@ -126,83 +124,106 @@ class OffPolicyUpdate:
 
     def train(self, updates: int) -> dict[str, float]:
         """So many gradient steps on what is stored."""
-        results: dict[bool, list[Tensor]] = {True: [], False: []}
+        results: dict[GradientStep, list[Tensor]] = {}
+        calls: dict[GradientStep, Any] = {}
+        bound: TensorDictBase | None = None
         self._copy_statistics()  # a normalizer may have moved since
         for data, index in self._batches.draw(updates):
-            whole = self.updates % self.actor_delay == 0
-            if not self._steps:
-                self._assemble(data, index)
-            if not results[whole]:
-                self._steps[whole].begin()
-            results[whole].append(self._steps[whole](data, index))
+            plan = self._plan = self._plan or self._assemble(data, index)
+            step = plan.every if self.updates % self.actor_delay == 0 else plan.critics
+            parts = index.split(self.batch_size)
+            if data is not bound:
+                bound, calls = data, {}
+            if step not in calls:
+                calls[step] = step.bind(data, parts[0])
+            results.setdefault(step, []).append(calls[step](*parts))
             self._batches.drawn()
             self.updates += 1
-        metrics: dict[str, float] = {}
-        for whole in (False, True):  # a name that both kinds of step have is averaged over all of them
-            if results[whole]:
-                means = torch.stack(results[whole]).mean(0) if len(results[whole]) > 1 else results[whole][0]
-                share = len(results[whole]) / (len(results[True]) + len(results[False]))
-                for name, mean in zip(self._steps[whole].names, means.tolist(), strict=True):
-                    both = share < 1 and all(name in self._steps[kind].names for kind in (True, False))
-                    metrics[name] = metrics.get(name, 0.0) + (share if both else 1.0) * mean
-        return metrics
+        return _averaged(results)
 
     def __str__(self) -> str:
         norm = f"gradient norm at most {self.max_grad_norm:g}, " if self.max_grad_norm is not None else ""
         delay = f"the actor once in {self.actor_delay} steps, " if self.actor_delay > 1 else ""
-        tau = "" if self._average is None else f"targets move by {self.tau:g}, "
+        rates = self.tau if isinstance(self.tau, Mapping) else {"": self.tau}
+        moves = " and ".join(f"{rate:g}{name and f' ({name})'}" for name, rate in rates.items())
+        tau = "" if self._average is None else f"targets move by {moves}, "
         step = (
             f"{self.updates_per_step:g} a frame after {self.learning_starts:,} frames, batches of {self.batch_size}, "
             f"{delay}{tau}{norm}compile {self.compile}"
         )
-        return diagram(self, Chain(self.loss, None, type(self.buffer).__name__), step, self._batch)
+        return diagram(self, self._view, self.optimizer, step, self._plan and self._plan.batch)
+
+    @property
+    def _view(self) -> LossView:
+        return LossView(self.loss, None, type(self.buffer).__name__)
 
     @property
     def compile_seconds(self) -> float:
         """Seconds spent compiling so far."""
-        return sum(step.compile_seconds for step in self._steps.values())
+        steps = {self._plan.every, self._plan.critics} if self._plan else set()
+        return sum(native.seconds for step in steps for native in step.native)
 
     def state_dict(self) -> dict[str, Any]:
         """Networks with their targets, coefficients, optimizer, counters. The replay is not in it: it saves itself."""
-        return {
-            "loss": self.loss.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
-            "counters": (self.frames, self.updates, self._due),
-        }
+        return save(self._parts()) | {"counters": (self.frames, self.updates, self._due)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restores :meth:`state_dict`; with an empty replay, training waits for ``learning_starts`` frames."""
-        restoring.load(self.loss, state["loss"])
-        self.optimizer.load_state_dict(state["optimizer"])
+        load(self._parts(), state)
         self.frames, self.updates, self._due = state["counters"]
-        self._steps = {}
+        self._plan = None
 
-    def _assemble(self, data: TensorDictBase, index: Tensor) -> None:
+    def _parts(self) -> dict[str, Any]:
+        return {"loss": self.loss, "optimizer": self.optimizer}
+
+    def _assemble(self, data: TensorDictBase, index: Tensor) -> Plan:
         batch = self._batches.gather(data, index)
-        source, owners = type(self.buffer).__name__, self._batches.settings()
-        names = wiring.check(self.loss, None, self.optimizer, batch, source, owners)
-        self._batch = batch
+        names = assembly(self._view, self.optimizer, batch, owners_of_gamma=self._batches.settings())
+        every = self._gradient_step(names, None, average=True)
+        if self.actor_delay == 1:
+            return Plan(every, every, batch)
+        only = self._critics(batch)
+        critics = self._gradient_step([name for name in names if name in only], only, average=not self.delay_targets)
+        return Plan(every, critics, batch)
+
+    def _gradient_step(
+        self, names: Sequence[str], only: Mapping[str, Sequence[Tensor]] | None, average: bool
+    ) -> GradientStep:
+        """A step on all losses, or on those of ``only`` and the parameters that each of these trains."""
+        params = optim.parameters(self.optimizer)
+        if only is not None:
+            kept = {id(p) for reached in only.values() for p in reached}
+            params = [p for p in params if id(p) in kept]
+
+        def gradients(data: TensorDictBase, index: Tensor) -> tuple[Tensor, Grads]:
+            batch = self._batches.gather(data, index)
+            if self.augment is not None:
+                batch = self.augment(batch)
+            out = self.loss(batch)
+            with torch.no_grad():
+                self._batches.write_back(data, index, batch)
+            grads = grads_of(out, params, only)
+            return metrics_of(out, names, like=grads[0]), grads
+
         steps = None if self.total_frames is None else self.total_frames * self.updates_per_step
-        settings: dict[str, Any] = {
-            "max_grad_norm": self.max_grad_norm,
-            "after": self._average,
-            "gather": self._batches.gather,
-            "write_back": self._batches.write_back,
+        return GradientStep(
+            gradients,
+            self.optimizer,
+            names,
+            params=params,
+            watch={"the loss": self.loss, "the augmentation": self.augment},
+            holds=self._batches.written(),
+            max_grad_norm=self.max_grad_norm,
+            average=self._average if average else None,
+            between=self.between,
+            apart=self.accumulate > 1,
             # a step costs 10 times a PPO step, so compiling pays 10 times sooner
-            "compile": worth_compiling(self.compile, steps, least_calls=3_000),
-            "written": self._batches.written(),
-            "may_fall_back": self.compile == "auto",
-        }
-        self._steps[True] = GradientStep(self.loss, self.optimizer, names, **settings)
-        if self.actor_delay > 1:
-            only = self._critics(batch)
-            names = [name for name in names if name in only]
-            settings["after"] = None if self.delay_targets else self._average
-            self._steps[False] = GradientStep(self.loss, self.optimizer, names, only=only, **settings)
+            mode=choose(self.compile, steps, least_calls=3_000),
+        )
 
     def _critics(self, batch: TensorDictBase) -> dict[str, list[Tensor]]:
         """The critics' loss entries, and the parameters they train: by name, and whatever trains no others."""
-        params = optimizers.parameters(self.optimizer)
+        params = optim.parameters(self.optimizer)
 
         def trial() -> dict[str, list[Tensor]]:
             out, reached = self.loss(batch.copy()), {}
@@ -213,7 +234,19 @@ class OffPolicyUpdate:
             critics = {id(p) for key in named for p in reached[key]}
             return {key: held for key, held in reached.items() if held and all(id(p) in critics for p in held)}
 
-        reached = restoring.undone(self.loss.buffers(), trial)
+        reached = undone(self.loss.buffers(), trial)
         if not reached:
-            raise UserError(f"actor_delay needs a critics' loss (loss_qvalue), {type(self.loss).__name__} has none")
+            raise UserError(f"actor_delay needs a critics' loss (loss_qvalue), {self._view.name} has none")
         return reached
+
+
+def _averaged(results: Mapping[GradientStep, Sequence[Tensor]]) -> dict[str, float]:
+    """The metrics of both kinds of step; a name that both have is averaged over all steps."""
+    metrics: dict[str, list[tuple[int, float]]] = {}
+    for step, tensors in results.items():
+        for name, mean in means(step.names, tensors).items():
+            metrics.setdefault(name, []).append((len(tensors), mean))
+    return {
+        name: sum(count / sum(count for count, _ in found) * mean for count, mean in found)
+        for name, found in metrics.items()
+    }

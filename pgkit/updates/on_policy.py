@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Mapping
-from logging import getLogger
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, cast
 
 import torch
@@ -13,19 +12,41 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from pgkit.compiling import check_compile, worth_compiling
-from pgkit.constants import Constants
-from pgkit.errors import UserError, whole, within
+from pgkit.checks import LossView, assembly, check_settings, diagram
+from pgkit.compiled import Compiled, Mode, check_compile, choose, compiled
+from pgkit.errors import UserError
 from pgkit.functional import standardize
-from pgkit.updates import restoring, wiring
-from pgkit.updates.chain import Chain
-from pgkit.updates.diagram import diagram
-from pgkit.updates.entries import another_policy
-from pgkit.updates.estimating import estimated
-from pgkit.updates.optimizers import check_optimizer
-from pgkit.updates.recorded import Block, recorded_block
-from pgkit.updates.sequences import as_rows, check_one_memory, check_time
-from pgkit.updates.step import GradientStep
+from pgkit.optim import parameters
+from pgkit.seams import Augmentation
+from pgkit.updates.minibatches import means, minibatches
+from pgkit.updates.sequences import as_rows
+from pgkit.updates.state import load, save
+from pgkit.updates.step import GradientStep, Grads, grads_of, metrics_of
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What the first rollout settles.
+
+    Args:
+        block: the advantage block in native code, where that is worth it.
+        keys: entries of a rollout that the loss reads.
+        anchors: of these, the ones that keep their value from before the first epoch when the advantage is estimated
+            again: what losses measure a change from.
+        step: on a minibatch.
+        batch: an example.
+    """
+
+    block: CompiledAdvantage | None
+    keys: Sequence[Any]
+    anchors: Sequence[Any]
+    step: GradientStep
+    batch: TensorDictBase
+
+    @property
+    def native(self) -> list[Compiled]:
+        """What is compiled."""
+        return [*self.step.native, *([self.block.native] if self.block else [])]
 
 
 class OnPolicyUpdate:
@@ -41,6 +62,8 @@ class OnPolicyUpdate:
         sequence_length: for recurrent networks: minibatches are whole sequences of so many steps (``minibatch_size``
             counts steps all the same), and gradients flow back so far. It divides the steps of a rollout. None: single
             rows.
+        accumulate: minibatches whose gradients add up to one optimizer step, weighted by their rows.
+        augment: ``batch -> batch`` that changes a minibatch before the loss reads it, inside the compiled step.
         max_grad_norm: bound of the gradient's norm; None: no bound.
         recompute_advantage: estimate the advantage again before every epoch (Andrychowicz et al., 2021).
         normalize_advantage: standardize each minibatch's advantage here; for losses that do not do it themselves.
@@ -62,6 +85,8 @@ class OnPolicyUpdate:
         epochs: int = 10,
         minibatch_size: int | None = 64,
         sequence_length: int | None = None,
+        accumulate: int = 1,
+        augment: Augmentation | None = None,
         max_grad_norm: float | None = 0.5,
         recompute_advantage: bool = False,
         normalize_advantage: bool = False,
@@ -71,161 +96,128 @@ class OnPolicyUpdate:
         compile: str = "auto",
         seed: int | None = None,
     ) -> None:
-        check_optimizer(optimizer)
         check_compile(compile)
-        whole(1, epochs=epochs, minibatch_size=minibatch_size, sequence_length=sequence_length)
-        within(0, float("inf"), target_kl=target_kl)
-        if schedules and total_frames is None:
-            raise UserError("schedules are functions of the progress: give total_frames too")
-        schedules = schedules or {}
-        for name in schedules:
-            if not callable(schedules[name]):
-                raise UserError(
-                    f"schedules: '{name}' is {schedules[name]!r}, give a function of the progress in [0, 1] "
-                    "(controllers.linear)"
-                )
-            if name != "lr" and not isinstance(getattr(loss, name, None), Tensor):
-                names = sorted(getattr(loss, "_schedulable_buffers", ()))
-                known = ["lr", *[key for key in names if isinstance(getattr(loss, key, None), Tensor)]]
-                raise UserError(
-                    f"schedules: {type(loss).__name__} has no coefficient '{name}', only {', '.join(known)}"
-                )
-        if normalize_advantage and getattr(loss, "normalize_advantage", False):
-            raise UserError(
-                f"{type(loss).__name__} normalizes the advantage already: leave normalize_advantage out here"
-            )
-        if sequence_length and minibatch_size and minibatch_size % sequence_length:
-            raise UserError(
-                f"minibatch_size={minibatch_size} is not a multiple of sequence_length={sequence_length}: a minibatch "
-                "is made of whole sequences"
-            )
         self.loss, self.advantage, self.optimizer = loss, advantage, optimizer
-        self.sequence_length = sequence_length
+        self.sequence_length, self.accumulate, self.augment = sequence_length, accumulate, augment
         self.epochs, self.minibatch_size, self.max_grad_norm = epochs, minibatch_size, max_grad_norm
         self.recompute_advantage, self.normalize_advantage = recompute_advantage, normalize_advantage
         self.target_kl, self.schedules, self.total_frames = target_kl, dict(schedules or {}), total_frames
         self.compile, self.frames = compile, 0
+        self.between: Callable[[Grads], Grads] | None = None  # changes the gradients before the optimizer's step
         self._generator = torch.Generator().manual_seed(int(torch.randint(2**62, ())) if seed is None else seed)
-        self._step: GradientStep | None = None
-        self._keys: list[Any] = []
-        self._old: list[Any] = []  # of these, what losses measure a change from: as before the first epoch
-        self._estimate: Block | None = None
-        self._held: Constants | None = None  # what a recorded advantage block holds
-        self._estimate_seconds = 0.0
-        self._batch: TensorDictBase | None = None
+        self._plan: Plan | None = None
+        check_settings(self._view, vars(self))
 
     def __call__(self, rollout: TensorDictBase) -> dict[str, float]:
         """Trains on a rollout ``[num_envs, T]``; metrics are means over the minibatches.
 
         Time is the last dimension: flattened, an advantage would run from one environment into the next.
         """
-        if self._step is None and self.advantage is not None:
-            check_time(rollout)
         self._follow_schedules()
-        length = self.sequence_length or 1
-        rows = rollout.numel() // length
-        size = int(min((self.minibatch_size or rollout.numel()) // length, rows))
-        results: list[Tensor] = []
-        flat, epoch = rollout, 0
+        if self._plan is None:
+            self._plan, flat = self._assemble(rollout)
+        else:
+            flat = self._rows(self._plan, rollout)
+        plan, size, results = self._plan, self._size(flat), list[Tensor]()
+        step = plan.step.bind(flat, torch.arange(size, device=flat.device))
+        epoch = 0
         for epoch in range(1, self.epochs + 1):
-            if epoch == 1 or self.recompute_advantage:
-                flat = self._flatten(rollout) if epoch == 1 else self._flatten(rollout).update(flat.select(*self._old))
-            if self._step is None:
-                self._step = self._assemble(flat, size, rows)
-            if epoch == 1:
-                self._step.begin()
-            order = torch.randperm(rows, generator=self._generator).to(flat.device or "cpu")
+            if epoch > 1 and self.recompute_advantage:
+                flat = self._rows(plan, rollout).update(flat.select(*plan.anchors))
+                step = plan.step.bind(flat, torch.arange(size, device=flat.device))
             start = len(results)
-            for index in order.split(size):
-                results.append(self._step(flat, index) if len(index) == size else self._step.eager(flat, index))
-            if self.target_kl is not None and self._kl(results[start:]) > 1.5 * self.target_kl:
+            for indices in minibatches(len(flat), size, self._generator, flat.device, self.accumulate):
+                results.append(step(*indices))
+            if self.target_kl is not None and self._kl(plan.step.names, results[start:]) > 1.5 * self.target_kl:
                 break
         self.frames += rollout.numel()
-        assert self._step is not None
-        means = torch.stack(results).mean(0).tolist()
-        metrics = dict(zip(self._step.names, means, strict=True))
-        return metrics | {
-            "epochs": float(epoch),
-            "learning_rate": float(self.optimizer.param_groups[0]["lr"]),
-        }
+        rate = float(self.optimizer.param_groups[0]["lr"])
+        return means(plan.step.names, results) | {"epochs": float(epoch), "learning_rate": rate}
 
     def __str__(self) -> str:
         size = self.minibatch_size or "the whole rollout"
         norm = f"gradient norm at most {self.max_grad_norm:g}, " if self.max_grad_norm is not None else ""
         step = f"{self.epochs} epochs of minibatches of {size}, {norm}compile {self.compile}"
-        return diagram(self, Chain(self.loss, self.advantage), step, self._batch)
+        return diagram(self, self._view, self.optimizer, step, self._plan and self._plan.batch)
+
+    @property
+    def _view(self) -> LossView:
+        return LossView(self.loss, self.advantage)
 
     @property
     def compile_seconds(self) -> float:
         """Seconds spent compiling so far."""
-        return self._estimate_seconds + (0.0 if self._step is None else self._step.compile_seconds)
+        return sum(native.seconds for native in self._plan.native) if self._plan else 0.0
 
     def state_dict(self) -> dict[str, Any]:
         """Networks, coefficients, optimizer, statistics of the advantage block, minibatch order and frame count."""
-        return {
-            "loss": self.loss.state_dict(),
-            "advantage": self.advantage.state_dict() if isinstance(self.advantage, nn.Module) else {},
-            "optimizer": self.optimizer.state_dict(),
-            "generator": self._generator.get_state(),
-            "frames": self.frames,
-        }
+        return save(self._parts()) | {"generator": self._generator.get_state(), "frames": self.frames}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restores :meth:`state_dict`; the compiled step is built again at the next call."""
-        restoring.load(self.loss, state["loss"])
-        if isinstance(self.advantage, nn.Module):
-            restoring.load(self.advantage, state["advantage"])
-        self.optimizer.load_state_dict(state["optimizer"])
+        load(self._parts(), state)
         self._generator.set_state(state["generator"])
-        self.frames = state["frames"]
-        self._step = None
+        self.frames, self._plan = state["frames"], None
 
-    def _flatten(self, rollout: TensorDictBase) -> TensorDictBase:
+    def _parts(self) -> dict[str, Any]:
+        block = self.advantage if isinstance(self.advantage, nn.Module) else None
+        return {"loss": self.loss, "advantage": block, "optimizer": self.optimizer}
+
+    def _size(self, flat: TensorDictBase) -> int:
+        """Rows of a minibatch, or sequences."""
+        return int(min((self.minibatch_size or flat.numel()) // (self.sequence_length or 1), len(flat)))
+
+    def _rows(self, plan: Plan, rollout: TensorDictBase) -> TensorDictBase:
         """The advantage, then the entries that the loss reads as ``[rows, ...]``."""
-        if self.advantage is not None and (self._estimate is None or (self._held and self._held.changed())):
-            self._estimate = self._prepare(self.advantage, rollout)
-        rollout = estimated(self.loss, self._estimate, rollout)
-        if self._step is None:
-            self._keys = wiring.read_keys(self.loss, rollout)
-            chain = Chain(self.loss, None)
-            anchors = [*chain.keys("value"), *chain.keys("sample_log_prob")]
-            self._old = [key for key in anchors if key in self._keys]
-        return as_rows(rollout.select(*self._keys), self.sequence_length)
+        rollout = self._view.estimated(rollout, plan.block or self.advantage)
+        return as_rows(rollout.select(*plan.keys), self.sequence_length)
 
-    def _prepare(self, advantage: Block, rollout: TensorDictBase) -> Block:
-        """The advantage block, compiled where it is a good part of the update: a few steps a rollout."""
-        few = self.epochs * rollout.numel() <= 4 * (self.minibatch_size or rollout.numel())
-        rollouts = None if self.total_frames is None else self.total_frames / rollout.numel()
-        if not (few and getattr(advantage, "recordable", False) and worth_compiling(self.compile, rollouts, 5_000)):
-            return advantage
-        start = time.perf_counter()
-        self._held = Constants(cast(nn.Module, advantage))
-        try:
-            return recorded_block(cast(TensorDictModuleBase, advantage), rollout)
-        except (RuntimeError, KeyError) as error:  # KeyError: it reads an entry that its in_keys leave out
-            getLogger("pgkit").debug("the advantage block cannot be recorded: %s", error)
-            return advantage
-        finally:
-            self._estimate_seconds += time.perf_counter() - start
+    def _assemble(self, rollout: TensorDictBase) -> tuple[Plan, TensorDictBase]:
+        """The plan, and the rollout's rows."""
+        view, block = self._view, self._compiled_advantage(rollout)
+        estimated = view.estimated(rollout, block or self.advantage)
+        keys = view.readable(estimated)
+        flat = as_rows(estimated.select(*keys), self.sequence_length)
+        batch = flat[: self._size(flat)]
+        names = assembly(view, self.optimizer, batch, rollout=rollout, resumed=self.frames > 0)
+        anchors = [key for key in (*view.keys("value"), *view.keys("sample_log_prob")) if key in keys]
+        step = self._gradient_step(names, flat.numel(), self.epochs * -(-len(flat) // len(batch)))
+        return Plan(block, keys, anchors, step, batch), flat
 
-    def _assemble(self, flat: TensorDictBase, size: int, rows: int) -> GradientStep:
-        self._batch = flat[:size]
-        check_one_memory(self.loss, self.advantage)
-        names = wiring.check(self.loss, self.advantage, self.optimizer, self._batch)
-        reason = another_policy(Chain(self.loss, self.advantage), self._batch)
-        if reason and not self.frames:  # a resumed collector may have collected with older weights
-            getLogger("pgkit").warning(reason)
-        per_rollout = self.epochs * -(-rows // size)
-        steps = None if self.total_frames is None else self.total_frames / flat.numel() * per_rollout
+    def _gradient_step(self, names: Sequence[str], frames: int, steps: int) -> GradientStep:
+        """One step on a minibatch, of so many steps for so many frames."""
+        params, key = parameters(self.optimizer), self._view.key("advantage") or "advantage"
+
+        def gradients(data: TensorDictBase, index: Tensor) -> tuple[Tensor, Grads]:
+            batch = cast(TensorDictBase, data[index])
+            if self.augment is not None:
+                batch = self.augment(batch)
+            if self.normalize_advantage:
+                batch = batch.copy().set(key, standardize(batch[key]))
+            out = self.loss(batch)
+            grads = grads_of(out, params)
+            return metrics_of(out, names, like=grads[0]), grads
+
+        calls = None if self.total_frames is None else self.total_frames / frames * steps
         return GradientStep(
-            self.loss,
+            gradients,
             self.optimizer,
             names,
+            watch={"the loss": self.loss, "the augmentation": self.augment},
             max_grad_norm=self.max_grad_norm,
-            before=self._standardize_advantage if self.normalize_advantage else None,
-            compile=worth_compiling(self.compile, steps, least_calls=30_000),
-            may_fall_back=self.compile == "auto",
+            between=self.between,
+            apart=self.accumulate > 1,
+            mode=choose(self.compile, calls, least_calls=30_000),
         )
+
+    def _compiled_advantage(self, rollout: TensorDictBase) -> CompiledAdvantage | None:
+        """The advantage block, compiled where it is a good part of the update: a few steps a rollout."""
+        few = self.epochs * rollout.numel() <= 4 * (self.minibatch_size or rollout.numel())
+        if not (few and self._view.recordable):
+            return None
+        rollouts = None if self.total_frames is None else self.total_frames / rollout.numel()
+        mode = choose(self.compile, rollouts, least_calls=5_000)
+        return None if mode == "off" else CompiledAdvantage(cast(TensorDictModuleBase, self.advantage), mode)
 
     def _follow_schedules(self) -> None:
         for name, schedule in self.schedules.items():
@@ -234,15 +226,34 @@ class OnPolicyUpdate:
                 for group in self.optimizer.param_groups:
                     group["lr"] = value
             else:
-                getattr(self.loss, name).fill_(value)
+                self._view.coefficients()[name].fill_(value)
 
-    def _kl(self, results: list[Tensor]) -> float:
-        assert self._step is not None
-        names = [name for name in ("approx_kl", "kl_approx") if name in self._step.names]
-        if not names:
-            raise UserError(f"target_kl needs a loss that reports approx_kl; {type(self.loss).__name__} does not")
-        return float(torch.stack(results).mean(0)[self._step.names.index(names[0])])
+    def _kl(self, names: Sequence[str], results: Sequence[Tensor]) -> float:
+        found = [name for name in ("approx_kl", "kl_approx") if name in names]
+        if not found:
+            raise UserError(f"target_kl needs a loss that reports approx_kl; {self._view.name} does not")
+        return means(names, results)[found[0]]
 
-    def _standardize_advantage(self, batch: TensorDictBase) -> TensorDictBase:
-        key = getattr(getattr(self.loss, "tensor_keys", None), "advantage", "advantage")
-        return batch.copy().set(key, standardize(batch[key]))
+
+class CompiledAdvantage:
+    """An advantage block in native code."""
+
+    def __init__(self, block: TensorDictModuleBase, mode: Mode) -> None:
+        def entries(data: TensorDictBase) -> list[Tensor]:
+            out = block(data.copy())
+            return [out[key] for key in block.out_keys]
+
+        def others(data: TensorDictBase) -> list[tuple[TensorDictBase]]:
+            """The same steps in another order."""
+            rolled = [data.apply(lambda x, dim=dim: x.clone().copy_(x.roll(1, dim))) for dim in range(data.batch_dims)]
+            return [(cast(TensorDictBase, one),) for one in rolled]
+
+        self.block = block
+        self.native = compiled(
+            entries, {"the advantage block": block}, others, mode, name="the advantage block", most=300
+        )
+
+    def __call__(self, rollout: TensorDictBase) -> TensorDictBase:
+        for key, x in zip(self.block.out_keys, self.native.bind(rollout)(), strict=True):
+            rollout.set(key, x)
+        return rollout

@@ -1,118 +1,119 @@
-"""One gradient step as one graph: minibatch, loss, gradient, norm clip, optimizer."""
+"""One optimizer step: gradients of minibatches, and what they change; one graph, or two with something between."""
 
 from __future__ import annotations
 
-import time
-import types
-import warnings
-from collections.abc import Callable, Mapping, Sequence
-from logging import getLogger
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from typing import Any, cast
 
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor, nn
+from torch import Tensor
 from torch.optim import Optimizer
 
-from pgkit.compiling import computed_once
-from pgkit.constants import Constants
+from pgkit import optim
+from pgkit.checks import is_loss
+from pgkit.compiled import Mode, compiled
 from pgkit.errors import UserError
-from pgkit.updates import optimizers
-from pgkit.updates.chain import is_loss
-from pgkit.updates.recorded import Step, recorded
+
+Gradients = Callable[[TensorDictBase, Tensor], tuple[Tensor, list[Tensor]]]
+Grads = list[Tensor]
 
 
-def _rows(data: TensorDictBase, index: Tensor) -> TensorDictBase:
-    return cast(TensorDictBase, data[index])
+def grads_of(out: TensorDictBase, params: Sequence[Tensor], only: Container[str] | None = None) -> Grads:
+    """Gradients of the sum of a loss's ``loss_*`` entries (of those in ``only``), zero where none depends on it."""
+    terms = [key for key in out.keys() if is_loss(key) and (only is None or key in only)]
+    total = torch.stack([out[key].sum() for key in terms]).sum()
+    return list(torch.autograd.grad(total, params, allow_unused=True, materialize_grads=True))
+
+
+def metrics_of(out: TensorDictBase, names: Iterable[str], like: Tensor) -> Tensor:
+    """The entries of a loss's result that are reported ``[len(names)]``, in the type of ``like``."""
+    return torch.stack([out[name].detach().to(like.dtype).mean() for name in names])
 
 
 class GradientStep:
-    """``step(data, index) -> metrics``: one optimizer step on the sum of the ``loss_*`` entries at ``data[index]``.
+    """``step(data, index) -> metrics``: gradients, norm clip, optimizer, target networks.
 
-    Compiled, all of it is one graph: the gather, the loss, ``autograd.grad``, the norm clip, the optimizer's own
-    function on the optimizer's own state, and ``after``. There are two ways to the graph. The step is recorded as
-    tensor operations and compiled for exactly these tensors, without dynamo at run time
-    (:mod:`~pgkit.updates.recorded`). Where it cannot be recorded, it is one
-    ``torch.compile(fullgraph=True)`` graph; once a pair of shapes has been seen, calls skip dynamo's guards. An
-    optimizer without a functional form steps outside the graph.
+    With an optimizer that has a rule (:func:`pgkit.optim.bound`) all of it is one compiled graph. Gradients that
+    are added up over minibatches, or that ``between`` changes, make two, and an optimizer without a rule steps by
+    itself.
 
     Args:
-        loss: TorchRL ``LossModule`` or any module from TensorDict to TensorDict with ``loss_*`` entries.
+        gradients: ``(data, index) -> (metrics, grads)``: gathers the minibatch, runs the loss; one gradient for each of
+            ``params``, as :func:`grads_of` makes them.
         optimizer: its parameters are the ones that are trained.
-        names: entries of the loss's result to report, in this order; ``grad_norm`` is added to them.
+        names: of the metrics; ``grad_norm`` is added to them.
+        params: the optimizer's parameters to step on; None: all.
+        watch: modules that ``gradients`` uses, by name, as in :func:`pgkit.compiled.compiled`.
+        holds: further tensors that change in place.
         max_grad_norm: bound of the gradient's norm over all parameters; None: no bound.
-        before: applied to the minibatch first.
-        after: called last, without gradients (target networks).
-        gather: ``(data, index) -> minibatch``; by default ``data[index]``.
-        write_back: called with ``(data, index, minibatch)`` after the loss, without gradients (priorities).
-        only: the ``loss_*`` entries to step on and the parameters each trains; the others stay. None: all.
-        compile: compile the step.
-        written: what ``write_back`` changes, besides ``data``.
-        may_fall_back: a step that cannot be compiled runs as it is, with a warning, in place of raising.
+        average: moves the target networks, last.
+        between: ``grads -> grads`` before the norm clip: the average over several learners.
+        apart: keeps the two graphs apart, for a call on several minibatches.
+        mode: as in :func:`pgkit.compiled.compiled`.
+
+    Attributes:
+        native: the compiled functions, with their ``seconds`` and ``rung``: the whole, or gradients and optimizer.
     """
 
     def __init__(
         self,
-        loss: nn.Module,
+        gradients: Gradients,
         optimizer: Optimizer,
         names: Sequence[str],
         *,
+        params: Sequence[Tensor] | None = None,
+        watch: Mapping[str, Any],
+        holds: Iterable[Tensor] = (),
         max_grad_norm: float | None = None,
-        before: Callable[[TensorDictBase], TensorDictBase] | None = None,
-        after: Callable[[], None] | None = None,
-        gather: Callable[[TensorDictBase, Tensor], TensorDictBase] = _rows,
-        write_back: Callable[[TensorDictBase, Tensor, TensorDictBase], None] | None = None,
-        only: Mapping[str, Sequence[Tensor]] | None = None,
-        compile: bool = False,
-        written: Sequence[Tensor] = (),
-        may_fall_back: bool = False,
+        average: Callable[[], None] | None = None,
+        between: Callable[[Grads], Grads] | None = None,
+        apart: bool = False,
+        mode: Mode = "off",
     ) -> None:
         if max_grad_norm is not None and max_grad_norm <= 0:
             raise UserError(f"max_grad_norm={max_grad_norm} lets nothing be trained: give a bound above 0, or None")
-        self.optimizer, self.loss = optimizer, loss
-        self.names = [*names, "grad_norm"]
-        self.compile_seconds = 0.0
-        self._runs: dict[Any, Step] = {}
-        self._constants: Constants | None = None
-        params = optimizers.parameters(optimizer)
-        if only is not None:
-            kept = {id(p) for reached in only.values() for p in reached}
-            params = [p for p in params if id(p) in kept]
-        functional = optimizers.functional(optimizer, fused=not compile, params=params)
-        apply, self._read_learning_rates, self._rates = functional or (None, lambda: None, [])
-        self._in_graph = apply is not None
+        self.optimizer, self.names, self.between = optimizer, [*names, "grad_norm"], between
+        self._params = optim.parameters(optimizer) if params is None else list(params)
+        self._rules = rules = None if mode == "off" else optim.bound(optimizer, self._params)
+        step = partial(optim.step, optimizer, self._params) if rules is None else rules.apply
+        self._apart = apart or between is not None or rules is None
 
-        def step(data: TensorDictBase, index: Tensor) -> tuple[Tensor, list[Tensor]]:
-            batch = gather(data, index)
-            batch = batch if before is None else before(batch)
-            out = loss(batch)
-            terms = [key for key in out.keys() if is_loss(key) and (only is None or key in only)]
-            total = torch.stack([out[key].sum() for key in terms]).sum()
-            grads = list(torch.autograd.grad(total, params, allow_unused=True, materialize_grads=True))
-            with torch.no_grad():
-                if write_back is not None:
-                    write_back(data, index, batch)
-                norm = torch.stack([grad.square().sum() for grad in grads]).sum().sqrt()
-                if max_grad_norm is not None:
-                    factor = computed_once((max_grad_norm / (norm + 1e-6)).clamp(max=1.0))
-                    grads = [grad * factor for grad in grads]
-                if apply is not None:
-                    apply(grads)
-                    if after is not None:
-                        after()
-                metrics = torch.stack([*(out[name].detach().to(norm.dtype).mean() for name in names), norm])
-            return metrics, [] if apply is not None else grads
+        @torch.no_grad()
+        def apply(grads: Grads) -> Tensor:
+            norm = torch.stack([grad.square().sum() for grad in grads]).sum().sqrt()
+            if max_grad_norm is not None:
+                factor = optim.computed_once((max_grad_norm / (norm + 1e-6)).clamp(max=1.0))
+                grads = [grad * factor for grad in grads]
+            step(grads)
+            if average is not None:
+                average()
+            return norm
 
-        # dynamo caches by code object: one of its own keeps each agent's graph apart from every other agent's
-        code = step.__code__.replace(co_name=f"step_{id(self)}")
-        step = types.FunctionType(code, step.__globals__, step.__name__, None, step.__closure__)
-        self._eager, self._after, self._params = step, after, params
-        self._compile, self._written, self._may_fall_back = compile, written, may_fall_back
+        def first(data: TensorDictBase, index: Tensor) -> list[Tensor]:
+            metrics, grads = gradients(data, index)
+            return [metrics, *grads] if self._apart else [torch.cat([metrics, apply(grads)[None]])]
 
-    def begin(self) -> None:
-        """Reads the learning rates off the optimizer, and looks for what was replaced in the loss.
+        def second(_: None, *grads: Tensor) -> list[Tensor]:
+            return [apply(list(grads))]
 
-        Call it before a series of steps.
+        held = [*self._params, *([] if rules is None else rules.tensors), *holds]
+        native = partial(compiled, watch=watch, holds=held)
+        self.native = (
+            native(first, others=other_rows, mode=mode, name="the update"),
+            native(second, others=_other_gradients, mode="off" if rules is None else mode, name="the optimizer's step"),
+        )
+
+    def __call__(self, data: TensorDictBase, index: Tensor) -> Tensor:
+        """One step on the rows ``index`` of ``data``; metrics ``[len(names)]``, still on the device."""
+        return self.bind(data, index)(index)
+
+    def bind(self, data: TensorDictBase, index: Tensor) -> Callable[..., Tensor]:
+        """``call(*indices) -> metrics`` on ``data``, for a series of steps; several indices add up to one step.
+
+        Learning rates are read off the optimizer, and what was replaced in the loss is noticed. The code is for indices
+        of the size of ``index``; others run as they are.
 
         Raises:
             UserError: a parameter of the optimizer was frozen, or a setting of it other than ``lr`` was changed.
@@ -122,86 +123,45 @@ class GradientStep:
                 "a parameter of the optimizer was frozen after the first step (requires_grad is False): what is "
                 "trained is decided when an update is built, build a new one with an optimizer of the others"
             )
-        changed = None if self._constants is None else self._constants.changed()
-        if changed:
-            getLogger("pgkit").warning(
-                "the update is compiled again: in the loss %s (what changes in place, by fill_, needs no such thing)",
-                changed,
-            )
-            self._runs, self._constants = {}, None
-        self._read_learning_rates()
-        for part in getattr(self.optimizer, "parts", [self.optimizer]):
-            part._opt_called = True  # what torch's schedulers look at before they warn that none stepped
+        if self._rules is not None:
+            self._rules.read()
+        first, size = self.native[0], len(index)
+        call = first.bind(data, index)
 
-    def __call__(self, data: TensorDictBase, index: Tensor) -> Tensor:
-        """One step on the rows ``index`` of ``data``; metrics ``[len(names)]``, still on the device."""
-        if not self._compile:
-            return self.eager(data, index)
-        signature = (index.shape, data.batch_size)
-        if signature in self._runs:
-            metrics, grads = self._runs[signature](data, index)
-        else:
-            start = time.perf_counter()
-            if not self._runs:
-                getLogger("pgkit").info("compiling the update, once: up to 40 seconds, less when it is in the cache")
-            self._constants = constants = Constants(self.loss)
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # the compiler's, on tensordict's and TorchRL's code
-                self._runs[signature], (metrics, grads) = self._build(data, index)
-            if self._runs[signature] is not self._eager and (changed := constants.changed()):
-                reason = f"the loss changes a number of its own as it runs, which is no part of a graph: {changed}"
-                self._fall_back(reason, UserError(f"{reason}; hold it as a tensor, or compile='off'"))
-                self._runs[signature], self._constants = self._eager, None
-            self.compile_seconds += time.perf_counter() - start
-        if not self._in_graph:
-            self._optimizer_step(grads)
-        return metrics
+        def run(index: Tensor) -> Sequence[Tensor]:
+            return call(index) if len(index) == size else first.function(data, index)
 
-    def eager(self, data: TensorDictBase, index: Tensor) -> Tensor:
-        """The same step outside the graph, for a minibatch of another size."""
-        metrics, grads = self._eager(data, index)
-        if not self._in_graph:
-            self._optimizer_step(grads)
-        return metrics
+        return self._in_two(run) if self._apart else lambda index: run(index)[0]
 
-    def _optimizer_step(self, grads: list[Tensor]) -> None:
-        self.optimizer.zero_grad(set_to_none=True)
-        for param, grad in zip(self._params, grads, strict=True):
-            param.grad = grad
-        self.optimizer.step()
-        if self._after is not None:
-            with torch.no_grad():
-                self._after()
+    def _in_two(self, run: Callable[[Tensor], Sequence[Tensor]]) -> Callable[..., Tensor]:
+        def call(*indices: Tensor) -> Tensor:
+            rows = sum(map(len, indices))
+            metrics, *grads = _sum(map(run, indices), [len(index) / rows for index in indices])
+            grads = grads if self.between is None else self.between(grads)
+            (norm,) = self.native[1].bind(None, *grads)(*grads)
+            return torch.cat([metrics, norm[None]])
 
-    def _build(self, data: TensorDictBase, index: Tensor) -> tuple[Step, tuple[Tensor, list[Tensor]]]:
-        """The compiled step for these shapes, and the result of its first call."""
-        states = [x for p in self._params for x in self.optimizer.state.get(p, {}).values() if torch.is_tensor(x)]
-        held = [*self._params, *states, *self._rates, *self.loss.parameters(), *self.loss.buffers(), *self._written]
-        try:
-            run = recorded(self._eager, list({id(x): x for x in held}.values()), data, index)
-            return run, run(data, index)
-        except RuntimeError as error:
-            getLogger("pgkit").debug("the step cannot be recorded (%s): torch.compile", error)
-        # fallback_random: the same random numbers as eager code
-        compiled = torch.compile(self._eager, fullgraph=True, dynamic=False, options={"fallback_random": True})
+        return call
 
-        def run_compiled(data: TensorDictBase, index: Tensor) -> tuple[Tensor, list[Tensor]]:
-            with torch.compiler.set_stance("default", skip_guard_eval_unsafe=True):
-                return compiled(data, index)
 
-        try:
-            with torch._dynamo.config.patch(trace_autograd_ops=True):
-                return run_compiled, compiled(data, index)
-        except torch._dynamo.exc.TorchDynamoException as error:
-            self._fall_back(str(error).strip().splitlines()[0], error)
-            return self._eager, self._eager(data, index)
+def _sum(results: Iterable[Sequence[Tensor]], shares: Sequence[float]) -> list[Tensor]:
+    """The weighted sum of the results, one in memory at a time; of a single one itself."""
+    total: list[Tensor] = []
+    for share, result in zip(shares, results, strict=True):
+        scaled = list(result) if len(shares) == 1 else [share * x for x in result]
+        total = [x.add_(more) for x, more in zip(total, scaled, strict=True)] if total else scaled
+    return total
 
-    def _fall_back(self, reason: str, error: Exception) -> None:
-        """Says why the step runs as it is from now on, or raises ``error`` where it may not."""
-        if not self._may_fall_back:
-            raise error
-        getLogger("pgkit").warning(
-            "the update cannot be compiled and runs without, several times slower (%s); compile='on' shows the "
-            "whole reason, compile='off' is silent",
-            reason,
-        )
+
+def other_rows(data: TensorDictBase, index: Tensor) -> Iterator[tuple[TensorDictBase, Tensor]]:
+    """Other rows of the data, as many, on which a compiled step must repeat the step."""
+    for shift in range(1, 5):
+        other = (index + shift * (len(index) + 1)) % (index.max() + 1)
+        # data that is the batch may be used without the index: it gets other rows as well, some of them repeated
+        rows = other // (1 + shift)
+        batch = data.batch_size == index.shape
+        yield cast(TensorDictBase, data.apply(lambda x, rows=rows: x.clone().copy_(x[rows]))) if batch else data, other
+
+
+def _other_gradients(_: None, *grads: Tensor) -> list[tuple[Any, ...]]:
+    return [(None, *(scale * grad for grad in grads)) for scale in (0.5, -3.0)]

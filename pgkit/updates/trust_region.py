@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -10,18 +11,31 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torch.optim import SGD, Optimizer
 
-from pgkit.compiling import check_compile, worth_compiling
-from pgkit.errors import UserError, whole, within
+from pgkit.checks import LossView, assembly, check_settings, diagram
+from pgkit.compiled import check_compile, choose
 from pgkit.functional import conjugate_gradient
-from pgkit.updates import restoring, wiring
-from pgkit.updates.chain import Chain
-from pgkit.updates.diagram import diagram
-from pgkit.updates.estimating import estimated
-from pgkit.updates.optimizers import check_optimizer, parameters
-from pgkit.updates.sequences import as_rows, check_time
-from pgkit.updates.step import GradientStep
+from pgkit.optim import parameters
+from pgkit.updates.minibatches import means, minibatches
+from pgkit.updates.sequences import as_rows
+from pgkit.updates.state import load, save
+from pgkit.updates.step import GradientStep, Grads, grads_of, metrics_of
 
 CRITIC = "loss_critic"
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What the first rollout settles.
+
+    Args:
+        names: of the policy's metrics.
+        critic: its step on a minibatch; None without a critic.
+        batch: an example.
+    """
+
+    names: Sequence[str]
+    critic: GradientStep | None
+    batch: TensorDictBase
 
 
 class TrustRegionUpdate:
@@ -77,48 +91,40 @@ class TrustRegionUpdate:
         compile: str = "auto",
         seed: int | None = None,
     ) -> None:
-        if optimizer is not None:
-            check_optimizer(optimizer)
         check_compile(compile)
-        whole(1, epochs=epochs, minibatch_size=minibatch_size, cg_steps=cg_steps)
-        within(0, float("inf"), max_kl=max_kl, damping=damping)
         self.loss, self.advantage, self.optimizer = loss, advantage, optimizer
         self.max_kl, self.cg_steps, self.damping = max_kl, cg_steps, damping
         self.sizes = [backtrack_factor**j for j in range(backtracks + 1)] if line_search else [1.0]
         self.line_search = line_search
         self.epochs, self.minibatch_size, self.max_grad_norm = epochs, minibatch_size, max_grad_norm
         self.total_frames, self.compile, self.frames = total_frames, compile, 0
+        check_settings(self._view, vars(self))
         self._params = [p for p in loss.actor_network_params.values(True, True) if p.requires_grad]
         self._generator = torch.Generator().manual_seed(int(torch.randint(2**62, ())) if seed is None else seed)
-        self._step: GradientStep | None = None
-        self._names: list[str] = []
-        self._batch: TensorDictBase | None = None
-        trained = {id(p) for p in self._params}
-        if optimizer is not None and any(id(p) in trained for p in parameters(optimizer)):
-            raise UserError(
-                "TrustRegionUpdate steps the actor itself: build the optimizer from critic.parameters() alone, and "
-                "share no layers between the two"
-            )
+        self.between: Callable[[Grads], Grads] | None = None  # changes the critic's gradients before its step
+        self._plan: Plan | None = None
 
     def __call__(self, rollout: TensorDictBase) -> dict[str, float]:
         """Trains on a rollout ``[num_envs, T]``: time is the last dimension."""
-        if not self._names and self.advantage is not None:
-            check_time(rollout)
-        rollout = estimated(self.loss, self.advantage, rollout)
-        flat = as_rows(rollout.select(*wiring.read_keys(self.loss, rollout)), None)
-        if not self._names:
-            self._assemble(flat)
-        metrics = self._step_policy(self.loss.keep_distribution(flat.copy()))
-        metrics |= self._step_critic(flat)
+        estimated = self._view.estimated(rollout, self.advantage)
+        flat = as_rows(estimated.select(*self._view.readable(estimated)), None)
+        plan = self._plan = self._plan or self._assemble(rollout, flat)
+        metrics = self._step_policy(self.loss.keep_distribution(flat.copy()), plan.names)
+        if plan.critic is not None:
+            metrics |= self._step_critic(plan.critic, flat)
         self.frames += len(flat)
         return metrics
 
     def __str__(self) -> str:
         step = f"KL at most {self.max_kl:g}, {'line search' if self.line_search else 'full step'}; then the critic, "
         step += f"{self.epochs} epochs of minibatches of {self.minibatch_size or 'the whole rollout'}"
-        return diagram(self, Chain(self.loss, self.advantage), step, self._batch)
+        return diagram(self, self._view, self.optimizer, step, self._plan and self._plan.batch)
 
-    def _step_policy(self, batch: TensorDictBase) -> dict[str, float]:
+    @property
+    def _view(self) -> LossView:
+        return LossView(self.loss, self.advantage)
+
+    def _step_policy(self, batch: TensorDictBase, names: Sequence[str]) -> dict[str, float]:
         out = self.loss(batch)
         before = self._policy_loss(out)
         start = torch.cat([p.detach().flatten() for p in self._params])
@@ -137,7 +143,7 @@ class TrustRegionUpdate:
                 break
         else:
             self._assign(start)
-        reported = {name: float(out[name].detach()) for name in self._names}
+        reported = {name: float(out[name].detach()) for name in names}
         return {**reported, **result, "cg_error": float(error)}
 
     def _fisher(self, batch: TensorDictBase) -> Callable[[Tensor], Tensor]:
@@ -157,60 +163,61 @@ class TrustRegionUpdate:
             for p, part in zip(self._params, vector.split([p.numel() for p in self._params]), strict=True):
                 p.copy_(part.view_as(p))
 
-    def _step_critic(self, flat: TensorDictBase) -> dict[str, float]:
-        if self._step is None:
-            return {}
-        self._step.begin()
+    def _step_critic(self, step: GradientStep, flat: TensorDictBase) -> dict[str, float]:
         size, results = int(min(self.minibatch_size or len(flat), len(flat))), []
+        call = step.bind(flat, torch.arange(size, device=flat.device))
         for _ in range(self.epochs):
-            for index in torch.randperm(len(flat), generator=self._generator).to(flat.device or "cpu").split(size):
-                results.append(self._step(flat, index) if len(index) == size else self._step.eager(flat, index))
-        return dict(zip(self._step.names, torch.stack(results).mean(0).tolist(), strict=True))
+            for indices in minibatches(len(flat), size, self._generator, flat.device):
+                results.append(call(*indices))
+        return means(step.names, results)
 
-    def _assemble(self, flat: TensorDictBase) -> None:
+    def _assemble(self, rollout: TensorDictBase, flat: TensorDictBase) -> Plan:
         rows, critic = len(flat), [] if self.optimizer is None else parameters(self.optimizer)
         size = min(self.minibatch_size or rows, rows)
-        self._batch = flat[:size]
         every = SGD([*self._params, *critic], lr=0.0)  # who is trained, by the step or by the optimizer
-        names = wiring.check(self.loss, self.advantage, every, self._batch)
-        self._names = [name for name in names if name not in (CRITIC, "explained_variance")]
+        names = assembly(self._view, every, flat[:size], rollout=rollout, resumed=self.frames > 0)
+        own = [name for name in names if name not in (CRITIC, "explained_variance")]
         if self.optimizer is None:
-            return
+            return Plan(own, None, flat[:size])
+        rest = [name for name in names if name not in own]
+
+        def gradients(data: TensorDictBase, index: Tensor) -> tuple[Tensor, Grads]:
+            out = self.loss(data[index])
+            grads = grads_of(out, critic, only=(CRITIC,))
+            return metrics_of(out, rest, like=grads[0]), grads
+
         steps = None if self.total_frames is None else self.total_frames / rows * self.epochs * -(-rows // size)
-        self._step = GradientStep(
-            self.loss,
+        mode = choose(self.compile, steps, least_calls=30_000)
+        step = GradientStep(
+            gradients,
             self.optimizer,
-            [name for name in names if name not in self._names],
+            rest,
+            watch={"the loss": self.loss},
             max_grad_norm=self.max_grad_norm,
-            only={CRITIC: critic},
-            compile=worth_compiling(self.compile, steps, least_calls=30_000),
-            may_fall_back=self.compile == "auto",
+            between=self.between,
+            mode=mode,
         )
+        return Plan(own, step, flat[:size])
 
     @property
     def compile_seconds(self) -> float:
         """Seconds spent compiling so far."""
-        return 0.0 if self._step is None else self._step.compile_seconds
+        step = self._plan and self._plan.critic
+        return sum(native.seconds for native in step.native) if step else 0.0
 
     def state_dict(self) -> dict[str, Any]:
         """Networks, the critic's optimizer, statistics of the advantage block, minibatch order and frame count."""
-        return {
-            "loss": self.loss.state_dict(),
-            "advantage": self.advantage.state_dict() if isinstance(self.advantage, nn.Module) else {},
-            "optimizer": {} if self.optimizer is None else self.optimizer.state_dict(),
-            "generator": self._generator.get_state(),
-            "frames": self.frames,
-        }
+        return save(self._parts()) | {"generator": self._generator.get_state(), "frames": self.frames}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restores :meth:`state_dict`; the compiled step is built again at the next call."""
-        restoring.load(self.loss, state["loss"])
-        if isinstance(self.advantage, nn.Module):
-            restoring.load(self.advantage, state["advantage"])
-        if self.optimizer is not None:
-            self.optimizer.load_state_dict(state["optimizer"])
+        load(self._parts(), state)
         self._generator.set_state(state["generator"])
-        self.frames, self._step, self._names = state["frames"], None, []
+        self.frames, self._plan = state["frames"], None
+
+    def _parts(self) -> dict[str, Any]:
+        block = self.advantage if isinstance(self.advantage, nn.Module) else None
+        return {"loss": self.loss, "advantage": block, "optimizer": self.optimizer}
 
 
 def _flat(tensors: tuple[Tensor, ...]) -> Tensor:

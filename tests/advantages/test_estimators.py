@@ -9,7 +9,7 @@ from torchrl.objectives.value import TDLambdaEstimator
 from torchrl.objectives.value.functional import vtrace_advantage_estimate
 
 from pgkit import advantages, collectors, envs, modules
-from pgkit.compiling import record
+from pgkit.compiled.native import record
 from tests.modules.test_discrete import Masked
 
 

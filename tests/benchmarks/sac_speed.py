@@ -124,27 +124,34 @@ def floor(threads: int) -> tuple[float, float]:
 def replay(threads: int, prioritized: bool) -> dict[str, float]:
     """Milliseconds a frame of replay and update: the write, the draw, the step with its gather and without."""
     from pgkit import data, updates
+    from pgkit.updates.step import grads_of, metrics_of
 
     torch.set_num_threads(threads)
     _, _, update = agent(0, 20_000, data.Prioritized() if prioritized else None)
     rollout, buffer = frames(STEPS), update.buffer
     update.train(1)
-    whole = update._steps[True]
+    step = update._plan.every
     index = buffer.sample_index(BATCH)[0]
     batch = update._batches.gather(buffer.data, index)
-    loss, optimizer = update.loss, update.optimizer
-    bare = updates.GradientStep(
-        loss, optimizer, whole.names[:-1], after=update._average, gather=lambda data, _: data.copy(), compile=True
-    )  # fmt: skip
+    loss, optimizer, names = update.loss, update.optimizer, step.names[:-1]
+    params = [p for group in optimizer.param_groups for p in group["params"]]
+
+    def gradients(data: Any, _: Any) -> Any:
+        out = loss(data.copy())
+        grads = grads_of(out, params)
+        return metrics_of(out, names, grads[0]), grads
+
+    watch = {"the loss": loss}
+    bare = updates.GradientStep(gradients, optimizer, names, watch=watch, average=update._average, mode="on")
     rows = torch.arange(BATCH)
-    bare(batch, rows)
+    whole, alone = step.bind(buffer.data, index), bare.bind(batch, rows)
     times: dict[str, list[float]] = {"write": [], "draw": [], "step": [], "step without gather": []}
     draws = 1 if prioritized else STEPS  # as the update draws them
     for _ in range(10):
         times["write"].append(contest.milliseconds(lambda: buffer.extend(rollout), calls=100) / STEPS)
         times["draw"].append(contest.milliseconds(lambda: buffer.sample_index(BATCH, draws), calls=100) / draws)
-        times["step"].append(contest.milliseconds(lambda: whole(buffer.data, index), calls=100))
-        times["step without gather"].append(contest.milliseconds(lambda: bare(batch, rows), calls=100))
+        times["step"].append(contest.milliseconds(lambda: whole(index), calls=100))
+        times["step without gather"].append(contest.milliseconds(lambda: alone(rows), calls=100))
     result = {name: median(values) for name, values in times.items()}
     result["memory, MB"] = sum(x.numel() * x.element_size() for x in buffer.data.values(True, True)) / 1e6
     return result

@@ -23,8 +23,9 @@ from torchrl.collectors import Collector
 from torchrl.objectives.value import GAE
 
 from pgkit import advantages, collectors, envs, losses, modules
+from pgkit.checks import LossView
 from pgkit.updates import GradientStep
-from pgkit.updates.wiring import read_keys
+from pgkit.updates.step import grads_of, metrics_of
 
 ENV_ID, NUM_ENVS, STEPS, ROWS, OBSERVATION, ACTION = "HalfCheetah-v5", 8, 256, 64, 17, 6
 
@@ -74,8 +75,8 @@ def steps(calls: int) -> dict[str, float]:
         how = "compiled" if compiled else "eager"
         for name, make in (("pgkit loss", pgkit_loss), ("TorchRL ClipPPOLoss", torchrl_parts.ppo_loss)):
             loss = make(*agent())
-            step, flat = pgkit_step(loss, rollout, compiled)
-            results[f"{name}, pgkit's step, {how}"] = contest.milliseconds(partial(step, flat, index), calls, warmup=20)
+            step = pgkit_step(loss, rollout, index, compiled)
+            results[f"{name}, pgkit's step, {how}"] = contest.milliseconds(partial(step, index), calls, warmup=20)
         loss = torchrl_parts.ppo_loss(*agent())
         update, flat = torchrl_parts.ppo_update(loss, compiled=compiled), rollout.reshape(-1)
         name = f"TorchRL ClipPPOLoss, TorchRL's way, {'torch.compile(update)' if compiled else how}"
@@ -88,14 +89,22 @@ def pgkit_loss(actor: Any, critic: Any) -> losses.ClipPPOLoss:
     return losses.ClipPPOLoss(actor, critic, clip_epsilon=0.2, critic_coeff=0.5, entropy_bonus=False)
 
 
-def pgkit_step(loss: Any, rollout: TensorDict, compiled: bool) -> tuple[GradientStep, Any]:
-    """pgkit's step for any loss, and the rollout as OnPolicyUpdate hands it to that step."""
-    flat = rollout.select(*read_keys(loss, rollout)).reshape(-1).contiguous()
+def pgkit_step(loss: Any, rollout: TensorDict, index: torch.Tensor, compiled: bool) -> Callable[..., Any]:
+    """pgkit's step for any loss, on the rollout as OnPolicyUpdate hands it to that step."""
+    flat = rollout.select(*LossView(loss).readable(rollout)).reshape(-1).contiguous()
     names = [key for key, value in loss(flat[:ROWS]).items() if value.numel() == 1]
     optimizer = torch.optim.Adam(loss.parameters(), lr=3e-4)
-    step = GradientStep(loss, optimizer, names, max_grad_norm=0.5, compile=compiled)
-    step.begin()
-    return step, flat
+    params = optimizer.param_groups[0]["params"]
+
+    def gradients(data: Any, index: torch.Tensor) -> tuple[Any, Any]:
+        out = loss(data[index])
+        grads = grads_of(out, params)
+        return metrics_of(out, names, grads[0]), grads
+
+    mode = "on" if compiled else "off"
+    return GradientStep(gradients, optimizer, names, watch={"the loss": loss}, max_grad_norm=0.5, mode=mode).bind(
+        flat, index
+    )
 
 
 def gae(calls: int) -> dict[str, float]:

@@ -149,9 +149,10 @@ def test_a_run_goes_on_by_the_command_it_printed(inside: Path):
     assert frames == ["frames", "10", "20", "30", "40"]
 
 
-def test_plot(inside: Path):
-    main(["plot", "r", "r", "-o", "both.png"])
-    assert Path("both.png").exists()
+def test_plot(inside: Path, capsys: pytest.CaptureFixture[str]):
+    for name, written in (("both.svg", "both.svg"), ("noext", "noext.png")):
+        main(["plot", "r", "r", "-o", name])
+        assert Path(written).exists() and capsys.readouterr().out == f"wrote {written}\n"
 
 
 def test_flags_reach_the_recipe(inside: Path, capsys: pytest.CaptureFixture[str]):
@@ -172,6 +173,15 @@ def test_flags_reach_the_recipe(inside: Path, capsys: pytest.CaptureFixture[str]
         (["cp", "ppo", "mine.txt"], "give one that ends in .py"),
         (["eval", "."], "not a run directory"),
         (["plot", "."], "not a run directory"),
+        (["run", "walk.py", "--run-dir", "x" * 300], "File name too long"),
+        (["run", "walk.py", "--resume", "x" * 300], "is not a run directory"),
+        (["cp", "ppo", "x" * 300 + ".py"], "cannot be written: File name too long"),
+        (["plot", "r", "-o", "x" * 300 + ".png"], "File name too long"),
+        (["eval", "x" * 300], "is not a run directory"),
+        (["run", "ppo", "--env-id", "MiniGrid-Empty-5x5-v0"], "registers it: PACKAGE:MiniGrid-Empty-5x5-v0"),
+        (["run", "walk.py", "--threads", "1e6"], "--threads 1000000: give at most 256"),
+        (["run", "walk.py", "--num-envs", str(2**63)], "--num-envs 9223372036854775808: give at most 1e+06"),
+        (["run", "walk.py", "--resume-if-possible"], "--resume-if-possible needs a --run-dir"),
     ],
 )
 def test_user_errors(inside: Path, capsys: pytest.CaptureFixture[str], words: list[str], message: str):
@@ -255,3 +265,49 @@ def test_ls_and_help_import_nothing_heavy():
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1] == "set()"
+
+
+def test_names_in_the_working_directory_hide_nothing_and_any_terminal_does(trained: Path, tmp_path: Path):
+    for folder in (tmp_path, tmp_path / "pandas", tmp_path / "torch"):
+        folder.mkdir(exist_ok=True)
+        (folder / "__init__.py").write_text("raise SystemExit('the wrong module')\n")
+    (tmp_path / "queue.py").write_text("raise SystemExit('the wrong module')\n")
+    (tmp_path / "walk.py").write_text(RECIPE)
+    done = pgkit("run", "walk.py", "--run-dir", "r", cwd=tmp_path, PYTHONIOENCODING="ascii", LC_ALL="C")
+    assert done.returncode == 0, done.stderr
+    assert "eval 7.0 ? 0.0" in done.stdout  # a plus-minus that this terminal does not have
+
+
+def test_an_error_in_the_user_s_code_is_one_line_and_the_user_s_own_frames(tmp_path: Path):
+    (tmp_path / "walk.py").write_text(
+        RECIPE.replace("log.step(frames)", "log.step(frames)\n            _ = 1 / (20 - frames)")
+    )
+    done = pgkit("run", "walk.py", "--run-dir", "r", "--total-frames", "40", cwd=tmp_path)
+    assert done.returncode == 1
+    saved, line, *frames = done.stderr.splitlines()
+    assert saved == "the run ends at an error; r has the checkpoint of 20 frames"
+    assert line == "error: ZeroDivisionError: division by zero"
+    assert len(frames) >= 2 and "_ = 1 / (20 - frames)" in done.stderr
+    assert "run.py" not in done.stderr and "site-packages" not in done.stderr and "Traceback" not in done.stderr
+
+
+def test_an_error_in_pgkit_or_below_shows_every_frame(tmp_path: Path):
+    (tmp_path / "walk.py").write_text(RECIPE.replace("log.step(frames)", "log.step(frames, None, 3)"))
+    done = pgkit("run", "walk.py", "--run-dir", "r", "--total-frames", "40", cwd=tmp_path)
+    assert done.returncode == 1 and "error: " in done.stderr
+    assert "metrics.py" in done.stderr and "walk.py" in done.stderr
+
+
+def test_a_reader_that_goes_away_is_no_error(trained: Path):
+    code = "from pgkit.cli.main import main; main(['ls'])"
+    with subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as ls:
+        ls.stdout.close()
+        assert ls.stderr.read() == b""
+    assert ls.returncode == 141
+
+
+def test_a_diverged_run_exits_with_3(tmp_path: Path):
+    (tmp_path / "walk.py").write_text(RECIPE.replace("log.step(frames)", "log.step(frames, None, {'x': float('nan')})"))
+    done = pgkit("run", "walk.py", "--run-dir", "r", "--total-frames", "20", cwd=tmp_path)
+    assert done.returncode == 3
+    assert done.stderr.splitlines()[-1].startswith("error: the training has diverged: train/x is not finite")

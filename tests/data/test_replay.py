@@ -92,7 +92,7 @@ def test_n_steps_stop_at_a_truncation_and_at_a_termination():
 
 def test_rows_never_written_do_not_reach_a_batch():
     buffer = data.ReplayBuffer(envs.make("Pendulum-v1"), 50, n_steps=3, seed=0)
-    for table in (buffer.frames, buffer.observations):
+    for table in (buffer.table.frames, buffer.table.observations):
         for x in table.values():
             if x.dtype.is_floating_point:
                 x.fill_(torch.nan)  # what an allocation may hold
@@ -217,7 +217,7 @@ def test_files_of_two_buffers_in_one_folder_are_apart(tmp_path):
     first, second = rollouts(env, 30, 2)
     one.extend(first)
     two.extend(second)
-    assert torch.equal(one.observations["observation"][:30], first["observation"][0])
+    assert torch.equal(one.table.observations["observation"][:30], first["observation"][0])
     folders = list((tmp_path / "replay").iterdir())
     assert len(folders) == 2 and all(any(folder.iterdir()) for folder in folders)
     (tmp_path / "file").touch()
@@ -283,3 +283,27 @@ def test_until_a_checkpoint_is_written_the_one_before_has_its_file(tmp_path):
         other = data.ReplayBuffer(env, 50)
         data.BesideCheckpoint(other, tmp_path / "buffer.pt", save=True).load_state_dict(state)
         assert other.written == written
+
+
+def test_a_replay_beyond_memory_is_refused_before_it_is_allocated():
+    # 10^12 frames of 17 observations, for an eighth of them finals, 6 actions and the reward in four bytes, two flags
+    # and an int64 row: 68 * 9/8 = 76.5 and 24 + 4 + 2 + 8 = 38 bytes
+    message = (
+        r"1,000,000,000,000 frames takes 114,500.0 GB, 76,500.0 of them for 'observation', and [\d.,]+ GB of memory"
+    )
+    with pytest.raises(UserError, match=message):
+        data.ReplayBuffer(envs.make("HalfCheetah-v5"), 10**12)
+
+
+@pytest.mark.parametrize("damage", ["cut", "empty", "no buffer", "text"])
+def test_damaged_files_are_one_line(tmp_path, damage):
+    path, buffer = tmp_path / "buffer.pt", data.ReplayBuffer(envs.make("Pendulum-v1"), 50)
+    buffer.save(path)
+    content = path.read_bytes()
+    if damage == "no buffer":
+        torch.save({"made_for": buffer.state_dict()["made_for"]}, path)
+    else:
+        path.write_bytes({"cut": content[: len(content) // 2], "empty": b"", "text": b"hello"}[damage])
+    with pytest.raises(UserError, match="is damaged or no saved replay buffer") as error:
+        buffer.load(path)
+    assert "\n" not in str(error.value)

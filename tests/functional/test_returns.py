@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from pgkit.functional import discounted_sum, generalized_advantage
+from pgkit.functional import discounted_sum, generalized_advantage, lambda_return, n_step_return, vtrace
 
 
 def column(*values, dtype=torch.float64):
@@ -58,3 +58,29 @@ def test_shapes_never_broadcast():
         generalized_advantage(x, x, x.squeeze(-1), flag, flag, 0.9, 0.9)
     with pytest.raises(TypeError, match="terminated must be boolean"):
         generalized_advantage(x, x, x, flag, x, 0.9, 0.9)
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
+@pytest.mark.parametrize("terminated", [True, False])
+def test_what_is_not_finite_after_an_end_does_not_reach_the_episode_before_it(bad, terminated):
+    torch.manual_seed(0)
+    value, after, reward = (torch.randn(1, 9, 1, dtype=torch.float64) for _ in range(3))
+    done = torch.zeros(1, 9, 1, dtype=torch.bool)
+    done[:, 4] = True
+    ended = done & terminated
+    dirty_value, dirty_after, dirty_reward = value.clone(), after.clone(), reward.clone()
+    for x in (dirty_value, dirty_after, dirty_reward):
+        x[:, 5:] = bad
+    if terminated:
+        dirty_after[:, 4] = bad  # the value of a terminal state is not read
+
+    def estimates(value, after, reward):
+        yield from generalized_advantage(value, after, reward, done, ended, 0.9, 0.8)
+        yield lambda_return(after, reward, done, ended, 0.9, 0.8)
+        yield n_step_return(after, reward, done, ended, 0.9, 3)
+        yield from vtrace(torch.zeros_like(value), value, after, reward, done, ended, 0.9, 0.8)
+
+    pairs = zip(estimates(value, after, reward), estimates(dirty_value, dirty_after, dirty_reward), strict=True)
+    for clean, dirty in pairs:
+        torch.testing.assert_close(clean[:, :5], dirty[:, :5], rtol=0, atol=0)
+        assert not dirty[:, 5:].isfinite().any()  # it is not hidden either

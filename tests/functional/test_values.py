@@ -35,3 +35,17 @@ def test_standardize():
     torch.testing.assert_close(standardize(x, mask)[:3], (x[:3] - 3) / x[:3].std())
     assert standardize(x[:1]).item() == 0  # one row has no deviation
     assert standardize(torch.full((3,), 7.0)).tolist() == [0, 0, 0]
+
+
+def test_standardize_over_some_dimensions_only():
+    # two columns, each with a mean and a deviation of its own; the masked element may be anything
+    x = torch.tensor([[1.0, 10.0], [2.0, 30.0], [3.0, float("nan")]])
+    mask = torch.tensor([[True, True], [True, True], [True, False]])
+    out = standardize(x, mask, dim=(0,))
+    torch.testing.assert_close(out[:, 0], torch.tensor([-1.0, 0.0, 1.0]))
+    torch.testing.assert_close(out[:2, 1], torch.tensor([-1.0, 1.0]) / 2**0.5)
+
+
+def test_masked_elements_do_not_reach_an_average():
+    value, mask = torch.tensor([1.0, 2.0, float("inf")]), torch.tensor([True, True, False])
+    assert explained_variance(value, torch.tensor([1.0, 2.0, 0.0]), mask).item() == 1.0

@@ -10,7 +10,7 @@ from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import ClipPPOLoss as TorchRLClipPPOLoss
 from torchrl.objectives.utils import ValueEstimators
 
-from pgkit import advantages, envs, losses, modules, updates
+from pgkit import advantages, envs, functional, losses, modules, updates
 
 
 def make_batch(actor, env, rows=32):
@@ -235,3 +235,15 @@ def test_padded_entries_have_no_part_in_losses_nor_metrics(name):
     batch["advantage"][4:] = batch["value_target"][4:] = batch["observation"][4:] = 100
     batch["collector", "mask"] = torch.tensor([True] * 4 + [False] * 2)
     assert_close(loss(batch).to_dict(), alone)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_surrogate_is_finite_far_from_the_policy_that_acted(dtype):
+    # e^1000 is infinite: min(inf * A, 1.2 A) is 1.2 A for A > 0, with the gradient 0 * inf if nothing is done about it
+    log_ratio = torch.tensor([1000.0, 1000.0, -1000.0, -1000.0, 0.0], dtype=dtype, requires_grad=True)
+    advantage = torch.tensor([2.0, -2.0, 2.0, -2.0, 3.0], dtype=dtype)
+    value = functional.clip_surrogate(log_ratio, advantage, 0.2)
+    assert value.isfinite().all() and value.tolist()[0] == pytest.approx(2.4)
+    assert value.tolist()[2:] == [0.0, pytest.approx(-1.6), 3.0]  # ratio 0: min(0, 1.6) and min(-0, -1.6); ratio 1
+    (grad,) = torch.autograd.grad(value.sum(), log_ratio)
+    assert grad.tolist() == [0.0, 0.0, 0.0, 0.0, 3.0]

@@ -10,7 +10,7 @@ from torchrl.objectives import SoftUpdate
 from pgkit import envs, heads, losses, modules
 from pgkit.errors import UserError
 
-BASES = {"Loss", "PolicyLoss", "QLoss", "ActorCriticLoss", "SoftQLoss"}
+BASES = {"Loss", "PolicyLoss", "QLoss", "ActorCriticLoss", "SoftQLoss", "Sum"}
 OF_TOKENS = {"GRPOLoss", "SFTLoss"}  # no environment to build networks from: tests/losses/test_grpo.py
 ALGORITHMS = sorted(set(losses.__all__) - BASES - OF_TOKENS)
 CRITICS = 4
@@ -95,16 +95,24 @@ OTHER = {
     "loss_critic_type": ("l2", "l1"), "loss_function": ("l2", "l1"), "max_alpha": (None, 0.5), "min_alpha": (None, 2.0),
     "delay_actor": (False, True), "delay_qvalue": (False, True), "delay_value": (False, True),
     "normalize_advantage": (False, True), "policy_noise": (0.2, 0.4), "noise_clip": (0.5, 0.05),
-    "subset": (None, 2), "target_entropy": (-1.0, -3.0), "clip_value": (None, 0.01),
+    "sub_sample_len": (2, 3), "subset": (None, 2), "target_entropy": (-1.0, -3.0), "clip_value": (None, 0.01),
 }  # fmt: skip
-FIXED = {"CrossQLoss": {"delay_actor", "delay_qvalue"}, "TQCLoss": {"loss_function"}}
+FIXED = {
+    "CrossQLoss": {"delay_actor", "delay_qvalue"},
+    "TQCLoss": {"loss_function"},
+    "DDPGLoss": {"delay_qvalue"},
+    "ReinforceLoss": {"entropy_coeff", "critic_coeff", "normalize_advantage"},
+}
 
 
 def takes(name):
-    kind = getattr(losses, name)
-    own = inspect.signature(kind.__init__).parameters
-    base = inspect.signature(losses.SoftQLoss.__init__).parameters if issubclass(kind, losses.SoftQLoss) else {}
-    return sorted((set(own) | set(base)) & set(OTHER) - FIXED.get(name, set()))
+    bases = [
+        base
+        for base in getattr(losses, name).__mro__
+        if base.__module__.startswith("pgkit.") and "__init__" in vars(base)
+    ]
+    known = {setting for base in bases for setting in inspect.signature(base.__init__).parameters}
+    return sorted(known & set(OTHER) - FIXED.get(name, set()))
 
 
 @pytest.mark.parametrize(("name", "setting"), [(name, setting) for name in ALGORITHMS for setting in takes(name)])
@@ -127,6 +135,24 @@ def test_what_a_loss_has_no_use_for_is_refused():
         make("TQCLoss", loss_function="l1")
     with pytest.raises(TypeError, match="delay_qvalue"):
         make("CrossQLoss", delay_qvalue=True)
+    for name in ALGORITHMS:
+        with pytest.raises(TypeError, match="unexpected keyword argument 'entropi_coeff'"):
+            make(name, entropi_coeff=0.1)
+
+
+def test_coefficients_are_exact_and_what_a_step_writes_is_float32():
+    """A compiled graph loses writes to a float64 scalar."""
+    written = {"beta", "log_alpha", "temperature.log_alpha"}
+    for name in ALGORITHMS:
+        loss = make(name)
+        scalars = {key: x for key, x in [*loss.named_buffers(), *loss.named_parameters()] if x.dim() == 0}
+        assert scalars or name == "ReinforceLoss"
+        for key, x in scalars.items():
+            assert x.dtype == (torch.float32 if key in written else torch.float64), (name, key)
+    assert (
+        make("SACLoss", gamma=0.97).gamma.item() == 0.97
+        and make("ClipPPOLoss", clip_epsilon=0.1).clip_epsilon.item() == 0.1
+    )
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)

@@ -172,5 +172,28 @@ def test_outputs_that_are_not_the_head_s_are_refused(outputs):
     head = heads.Quantiles(25, drop=0) if outputs == 1 else None
     loss = losses.DDPGLoss(actor, critic, head=head)
     SoftUpdate(loss, tau=0.1)
-    with pytest.raises(UserError, match="needs (25 outputs|one output) of each of the 1 critics, there are 1 of"):
+    with pytest.raises(UserError, match="needs (25 outputs|one output) of each of the 1 critics, there are [15] of 1"):
         loss(batch(dtype=torch.float32))
+
+
+def test_a_quantile_critic_s_target_is_its_own_atoms():
+    # everywhere the quantiles (4, 0): sorted, the larger left out where drop=1: y = 1 + 0.5 * 0 or 1 + 0.5 * (0, 4)
+    env = envs.make("Pendulum-v1")
+    for drop, mean in ((1, 1.0), (0, 2.0)):
+        critic = modules.q_value(env, 1, (), head=heads.Quantiles(2, drop=drop))
+        last = critic.module.layers[-1]
+        last.weight.data.zero_()
+        last.bias.data[:, 0] = torch.tensor([[4.0, 0.0]])
+        loss = losses.DDPGLoss(modules.deterministic_actor(env, (8,)), critic, gamma=0.5)
+        SoftUpdate(loss, tau=0.1)
+        rows = batch(4, 3, 1, torch.float32)
+        rows["next", "reward"].fill_(1.0)
+        rows["next", "terminated"].fill_(False)
+        assert loss(rows)["target_value"] == mean
+
+
+def test_settings_that_are_fixed_here_are_refused():
+    env = envs.make("Pendulum-v1")
+    for setting in ("num_qvalue_nets", "delay_qvalue"):
+        with pytest.raises(TypeError, match=setting):
+            losses.DDPGLoss(modules.deterministic_actor(env), modules.q_value(env, 1), **{setting: 1})

@@ -103,7 +103,9 @@ def test_values_by_hand():
     assert out["loss_actor"].item() == pytest.approx(-(2.5 + 0.1 * ENTROPY), rel=1e-6)
     assert out["entropy"].item() == pytest.approx(ENTROPY, rel=1e-6)
     assert out["loss_alpha"].item() == pytest.approx(-math.log(0.1) * (0.98 * math.log(2) - ENTROPY), rel=1e-5)
-    assert loss.target_entropy == pytest.approx(0.98 * math.log(2))
+    known = by_hand(alpha_init=0.1, num_actions=2)[0]
+    assert known.target_entropy.item() == pytest.approx(0.98 * math.log(2))
+    assert known(data.copy())["loss_alpha"] == out["loss_alpha"]  # the same as read off the batch
     torch.testing.assert_close(
         data["td_error"], torch.tensor([6 - y, 8 - y, 7], dtype=torch.float64), rtol=1e-6, atol=0
     )
@@ -276,10 +278,10 @@ def test_several_discrete_actions_at_once_are_refused():
 def test_the_target_entropy_comes_from_the_number_of_actions():
     env = envs.make("CartPole-v1", num_envs=2)
     networks = modules.categorical_actor(env, (8,)), modules.discrete_q_value(env, 2, (8,))
-    expected = pytest.approx(0.98 * math.log(2))
-    assert losses.DiscreteSACLoss(*networks, num_actions=2).target_entropy == expected
-    assert losses.DiscreteSACLoss(*networks, action_spec=env.action_spec_unbatched).target_entropy == expected
-    with pytest.raises(UserError, match="read off the first batch"):
+    for known in ({"num_actions": 2}, {"action_spec": env.action_spec_unbatched}):
+        target = losses.DiscreteSACLoss(*networks, **known).target_entropy
+        assert target.item() == pytest.approx(0.98 * math.log(2)) and target.dtype == torch.float64
+    with pytest.raises(UserError, match="read off each batch"):
         _ = losses.DiscreteSACLoss(*networks).target_entropy
 
 

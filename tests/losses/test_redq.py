@@ -138,12 +138,12 @@ def test_an_ensemble_of_one_s_own_without_members_and_a_list_take_a_subset_too()
     actor, critics = modules.tanh_normal_actor(env, (8,)), modules.q_value(env, 5, (8,))
     loss = losses.REDQLoss(actor, critics)
     data, index = batch(), torch.tensor([4, 0])
-    some = loss.returns(data, data["action"], loss.qvalue_network_params, index)
+    some = loss.outputs(data, data["action"], loss.qvalue_network_params, index)
     loss.qvalue_network.members = None
-    torch.testing.assert_close(loss.returns(data, data["action"], loss.qvalue_network_params, index), some)
+    torch.testing.assert_close(loss.outputs(data, data["action"], loss.qvalue_network_params, index), some)
     several = losses.REDQLoss(actor, [modules.q_value(env, 1, (8,)) for _ in range(5)])
-    whole = several.returns(data, data["action"], several.qvalue_network_params)
-    some = several.returns(data, data["action"], several.qvalue_network_params, index)
+    whole = several.outputs(data, data["action"], several.qvalue_network_params)
+    some = several.outputs(data, data["action"], several.qvalue_network_params, index)
     torch.testing.assert_close(some, whole[:, index])
 
 
@@ -190,9 +190,9 @@ def test_some_critics_of_layers_that_all_of_them_share():
 
     loss = losses.SACLoss(modules.tanh_normal_actor(env, (8,)), modules.q_value(env, 8, body=body), subset=2)
     data, index = batch(), torch.tensor([4, 0])
-    whole = loss.returns(data, data["action"], loss.qvalue_network_params)
+    whole = loss.outputs(data, data["action"], loss.qvalue_network_params)
     torch.testing.assert_close(
-        loss.returns(data, data["action"], loss.qvalue_network_params, index), whole[..., index, :]
+        loss.outputs(data, data["action"], loss.qvalue_network_params, index), whole[..., index, :]
     )
 
 

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
+from tensordict.nn import CompositeDistribution, TensorDictModule
 from torch import nn
 from torchrl.modules import ProbabilisticActor, TanhNormal
 from torchrl.objectives import SACLoss as TorchRLSACLoss
@@ -158,14 +158,21 @@ def test_each_term_trains_its_own_parameters_and_an_ensemble_is_its_members():
 def test_target_entropy_is_minus_the_number_of_action_dimensions(name, dimensions):
     env = envs.make(name)
     obs = env.observation_spec_unbatched["observation"].shape[0]
-    loss = losses.SACLoss(modules.tanh_normal_actor(env, (4,)), modules.q_value(env, hidden=(4,)))
-    SoftUpdate(loss, tau=0.1)
-    with pytest.raises(UserError, match="read off the first batch"):
-        _ = loss.target_entropy
-    loss(batch(4, obs, dimensions))
-    assert loss.target_entropy == -dimensions
-    known = losses.SACLoss(loss.actor_network, modules.q_value(env, hidden=(4,)), action_spec=env.action_spec_unbatched)
-    assert known.target_entropy == -dimensions
+    actor, critics = modules.tanh_normal_actor(env, (4,)), modules.q_value(env, hidden=(4,))
+    known = losses.SACLoss(actor, critics, action_spec=env.action_spec_unbatched, alpha_init=0.5)
+    assert known.target_entropy == -dimensions and known.target_entropy.dtype == torch.float64
+    seen = losses.SACLoss(actor, critics, alpha_init=0.5)  # without the spec, each batch shows it
+    with pytest.raises(UserError, match="read off each batch: give action_spec="):
+        _ = seen.target_entropy
+    rows, outs = batch(4, obs, dimensions), []
+    for loss in (known, seen):
+        SoftUpdate(loss, tau=0.1)
+        torch.manual_seed(0)
+        outs.append(loss(rows.copy()))
+    torch.testing.assert_close(outs[0]["loss_alpha"], outs[1]["loss_alpha"])
+    torch.testing.assert_close(outs[0]["loss_alpha"], -math.log(0.5) * (-outs[0]["entropy"] - dimensions))
+    with pytest.raises(UserError, match="read off each batch"):  # a batch leaves no trace in the loss
+        _ = seen.target_entropy
 
 
 def test_importance_weights_scale_the_critics_loss():
@@ -193,13 +200,13 @@ def test_a_single_critic_with_a_head_has_outputs_and_not_critics():
     net = TensorDictModule(Joined(5), in_keys=["observation", "action"], out_keys=["state_action_value"])
     loss = losses.DDPGLoss(actor, net, head=heads.Quantiles(5, 0))
     rollout = collectors.VectorCollector(env, actor, frames_per_batch=16).rollout().reshape(-1)
-    assert loss.returns(rollout, rollout["action"], loss.qvalue_network_params).shape == (16, 1, 5)
+    assert loss.outputs(rollout, rollout["action"], loss.qvalue_network_params).shape == (16, 1, 5)
     several = [modules.q_value(env, 1, (8,), head=heads.Quantiles(5, 1)) for _ in range(2)]
     stochastic = modules.tanh_normal_actor(env, (8,))
     loss = losses.TQCLoss(stochastic, several)
     SoftUpdate(loss, tau=0.1)
     assert loss.head == heads.Quantiles(5, 1)
-    assert loss.returns(rollout, rollout["action"], loss.qvalue_network_params).shape == (16, 2, 5)
+    assert loss.outputs(rollout, rollout["action"], loss.qvalue_network_params).shape == (16, 2, 5)
     assert loss(rollout)["loss_qvalue"] > 0
 
 
@@ -232,3 +239,98 @@ def test_the_target_entropy_of_an_environment_s_composite_spec():
     actor, critics = modules.tanh_normal_actor(env), modules.q_value(env)
     for spec in (env.full_action_spec, env.full_action_spec_unbatched, env.action_spec):
         assert losses.SACLoss(actor, critics, action_spec=spec).target_entropy == -1
+
+
+def test_the_temperature_has_one_owner_and_torchrl_s_names():
+    env = envs.make("Pendulum-v1")
+    actor, critics = modules.tanh_normal_actor(env, (8,)), modules.q_value(env, hidden=(8,))
+    loss = losses.SACLoss(actor, critics, alpha_init=0.3, target_entropy=-2.0, min_alpha=0.2, max_alpha=0.4)
+    assert isinstance(loss.temperature, controllers.Temperature) and loss.log_alpha is loss.temperature.log_alpha
+    assert next(iter(dict(loss.named_parameters()))) == "log_alpha"  # first and once, as before it was a block's
+    assert loss.target_entropy == loss.temperature.target_entropy == -2
+    loss.log_alpha.data.fill_(5.0)
+    assert loss.alpha.item() == pytest.approx(0.4)
+    fixed = losses.SACLoss(actor, critics, alpha_init=0.3, fixed_alpha=True)
+    assert fixed.alpha.item() == 0.3 and fixed.alpha.dtype == torch.float64
+    assert not [name for name, _ in fixed.named_parameters() if "alpha" in name]
+
+
+@pytest.mark.parametrize("fixed", [False, True])
+def test_a_state_from_before_the_temperature_was_a_block_is_loaded(fixed):
+    env = envs.make("Pendulum-v1")
+    make = lambda: losses.SACLoss(  # noqa: E731
+        modules.tanh_normal_actor(env, (8,)), modules.q_value(env, hidden=(8,)), fixed_alpha=fixed, alpha_init=0.5
+    )
+    loss, state = make(), make().state_dict()
+    old = {name: x for name, x in state.items() if not name.startswith("temperature.")} | {
+        "log_alpha": torch.tensor(-2.0)
+    }
+    loss.load_state_dict(old)
+    assert loss.alpha.item() == pytest.approx(math.exp(-2))
+    loss.load_state_dict(state)
+    assert loss.alpha.item() == pytest.approx(0.5)
+
+
+def test_a_coefficient_is_exact_in_a_float64_agent():
+    loss, _ = by_hand(temperature=controllers.FixedTemperature(0.1))
+    loss.make_value_estimator(gamma=0.97)
+    assert loss.gamma.item() == 0.97 and loss.alpha.item() == 0.1
+    rows = batch(8).double()
+    rows["next", "done"], rows["next", "terminated"] = (rows["next", key].bool() for key in ("done", "terminated"))
+    steps = torch.full((8, 1), 3)
+    zero = heads.Returns.certain(torch.ones(8, dtype=torch.float64))
+    target = loss.target(rows.set("steps_to_next_obs", steps), zero).mean
+    expected = rows["next", "reward"] + 0.97**3 * ~rows["next", "terminated"]
+    torch.testing.assert_close(target, expected.squeeze(-1), rtol=0, atol=1e-15)
+    assert loss.target(rows.float(), heads.Returns.certain(torch.ones(8))).dtype == torch.float32
+
+
+def test_augmented_copies_share_the_mean_of_their_targets_and_the_actor_takes_the_first():
+    # two copies of one row: next observations 2 and 4, a' = 0, min Q' = 4 and 8: y = 1 + 0.5 * (4 + 8) / 2 = 4 for both
+    # observations 1 and 3, a = 0.5: Q = 2.5, 3.5 and 6.5, 9.5: squares 2.25 + 0.25 and 6.25 + 30.25, mean 19.5
+    # the actor sees the first copy: -min Q(1, 0) = -2
+    loss, data = by_hand(temperature=controllers.FixedTemperature(0.0), augmented=True)
+    row, other = data[:1], data[:1].clone()
+    other["observation"], other["next", "observation"] = other["observation"] + 2, other["next", "observation"] + 2
+    both = torch.stack([row, other])
+    out = loss(both)
+    assert out["loss_qvalue"].item() == pytest.approx(19.5, abs=1e-4)
+    assert out["loss_actor"].item() == pytest.approx(-2.0, abs=1e-5)
+    torch.testing.assert_close(both["td_error"], torch.tensor([[1.5], [5.5]], dtype=torch.float64), atol=1e-4, rtol=0)
+    apart = by_hand(temperature=controllers.FixedTemperature(0.0))[0](both.clone())  # y = 3 and 5
+    assert apart["loss_qvalue"].item() == pytest.approx((0.5 + 2.25 + 20.25) / 2, abs=1e-4)
+
+
+def test_the_terms_of_a_composite_action_are_those_of_its_one_part():
+    env = envs.make("Pendulum-v1")
+    plain = losses.SACLoss(modules.tanh_normal_actor(env, (8,)), modules.q_value(env, 2, (8,)), target_entropy=-1.0)
+    net = plain.actor_network[0]
+    keys = [("params", "torque", "loc"), ("params", "torque", "scale")]
+    net = TensorDictModule(net.module, net.in_keys, keys)
+    kwargs = {"distribution_map": {"torque": TanhNormal}, "distribution_kwargs": {"torque": {"low": -2.0, "high": 2.0}}}
+    actor = ProbabilisticActor(
+        net, in_keys=["params"], out_keys=["action"], distribution_class=CompositeDistribution,
+        distribution_kwargs=kwargs, return_log_prob=True,
+    )  # fmt: skip
+
+    class Critics(nn.Module):
+        num_critics = 2
+
+        def __init__(self):
+            super().__init__()
+            self.net = plain.qvalue_network.module
+
+        def forward(self, observation, action):
+            return self.net(observation, action["torque"])
+
+    critics = TensorDictModule(Critics(), ["observation", "action"], ["state_action_value"])
+    parts = losses.SACLoss(actor, critics)  # -1, read off the action's parts
+    rows = batch(8)
+    results = []
+    for loss in (plain, parts):
+        SoftUpdate(loss, tau=0.1)
+        torch.manual_seed(0)
+        results.append(loss(rows.copy()))
+        rows["action"] = TensorDict({"torque": rows["action"]}, [8])
+    for key in ("loss_actor", "loss_qvalue", "loss_alpha", "entropy"):
+        torch.testing.assert_close(results[1][key], results[0][key])

@@ -1,3 +1,4 @@
+import sys
 from pathlib import Path
 
 import pytest
@@ -22,10 +23,11 @@ constant = 3
 @pytest.fixture
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "my_halves.py").write_text(MODULE)
+    (tmp_path / "my_parts.py").write_text("")
     for shadow in ("queue.py", "pandas.py"):
         (tmp_path / shadow).write_text("raise SystemExit('the wrong module')\n")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.syspath_prepend(str(tmp_path / "nowhere"))  # restores sys.path
+    monkeypatch.setattr(sys, "meta_path", [*sys.meta_path])
     return tmp_path
 
 
@@ -52,6 +54,7 @@ def test_a_wrapper_and_an_id_come_from_the_working_directory_which_hides_nothing
     assert env.env_id == "my_halves:Half-v0 (action repeat 2)"
     env.close()
     assert episode(args, 10)[0][:3] == [1.0, 1.0, 1.0]  # two steps of reward 1/2
+    assert str(here) not in sys.path
     args = RunArgs(env_id="CartPole-v1", wrapper="my_halves:Halved", env={"max_episode_steps": 3})
     assert episode(args, 10) == ([0.5, 0.5, 0.5], 3)
 

@@ -346,7 +346,7 @@ def test_an_error_amid_an_update_keeps_the_checkpoint_before(kit: SimpleNamespac
     class Update(kit.Counter):
         def __call__(self) -> None:
             self.frames += 10
-            _ = 1 / (30 - self.frames)
+            _ = 1 / (40 - self.frames)
 
     with pytest.raises(ZeroDivisionError), run.Run(arguments(tmp_path / "r"), "walk") as log:
         update = Update()

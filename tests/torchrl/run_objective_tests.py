@@ -30,7 +30,7 @@ from pgkit import losses
 
 DROPPED: dict[str, Any] = {
     "device": None, "deactivate_vmap": None, "functional": None, "value_network": None, "delay_value": False,
-    "skip_done_states": False,
+    "skip_done_states": False, "scalar_output_mode": None,
 }  # fmt: skip
 """Keyword and the value at which it asks for nothing; None: at any value."""
 

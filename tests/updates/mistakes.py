@@ -283,6 +283,20 @@ def flattened_rollout() -> None:
     agent.train()
 
 
+def shuffled_rollout() -> None:
+    """The steps of a rollout were shuffled, so that the next value would be that of another step."""
+    agent = Agent()
+    agent.rollout = agent.rollout[:, torch.randperm(agent.rollout.shape[1])]
+    agent.train()
+
+
+def empty_rollout() -> None:
+    """The rollout has no steps."""
+    agent = Agent()
+    agent.rollout = agent.rollout[:, :0]
+    agent.train()
+
+
 def advantage_of_the_actor() -> None:
     """The advantage block was given the actor in place of the critic."""
     agent = Agent()
@@ -350,7 +364,8 @@ MISTAKES: list[Callable[[], None]] = [
     action_out_of_range, action_outside_the_bounds, reward_without_the_trailing_1, flags_as_numbers,
     parameter_without_optimizer, optimizer_of_another_agent, frozen_parameter_in_the_optimizer, two_critics,
     two_owners_of_gamma, two_owners_of_gamma_in_the_replay, two_owners_of_lambda, a_loss_a_row, no_loss_entry,
-    own_loss_that_broadcasts, flattened_rollout, advantage_of_the_actor, critic_of_two_values, shared_parameter_twice,
+    own_loss_that_broadcasts, flattened_rollout, shuffled_rollout, empty_rollout,
+    advantage_of_the_actor, critic_of_two_values, shared_parameter_twice,
     advantage_with_a_gradient, critics_of_states, an_entry_that_the_replay_does_not_keep,
 ]  # fmt: skip
 

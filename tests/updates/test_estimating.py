@@ -23,7 +23,7 @@ def test_what_the_block_returns_counts():
         update.advantage, update.loss.normalize_advantage = halved, False
         metrics.append(update(make_rollout()))
     assert metrics[0] == metrics[1]
-    update.advantage = update._estimate = lambda rollout: None
+    update.advantage = lambda rollout: None
     with pytest.raises(UserError, match="the advantage block <lambda> returned a NoneType: return the rollout"):
         update(make_rollout())
 
@@ -101,18 +101,13 @@ def test_a_coefficient_that_is_replaced_takes_effect(compile):
     assert before != 0 and update(make_rollout())["loss_entropy"] == 0
 
 
-def test_settings_of_the_optimizer_that_change_under_way_are_refused():
-    update = make_agent()
-    update(make_rollout())
-    update.optimizer.param_groups[0]["lr"] = 1e-4
-    update(make_rollout())
+def test_without_a_graph_settings_of_the_optimizer_may_change_under_way():
+    update, twin = (make_agent(compile="off", epochs=1) for _ in range(2))
+    for agent in (update, twin):
+        agent(make_rollout(0))
     update.optimizer.param_groups[0]["betas"] = (0.5, 0.9)
-    with pytest.raises(
-        UserError, match=r"betas changed from \(0.9, 0.999\) to \(0.5, 0.9\): while training only lr may"
-    ):
-        update(make_rollout())
+    for agent in (update, twin):
+        agent(make_rollout(1))
+    assert not torch.equal(*(torch.cat([p.flatten() for p in agent.loss.parameters()]) for agent in (update, twin)))
     update.optimizer.load_state_dict(update.optimizer.state_dict())
-    with pytest.raises(UserError, match="loaded after its first step"):
-        update(make_rollout())
-    update.load_state_dict(update.state_dict())
-    update(make_rollout())
+    update(make_rollout(2))

@@ -59,14 +59,15 @@ def prioritized(n_steps=1):
     ],
     ids=["plain", "prioritized, 3 steps, delayed actor", "TorchRL's loss", "TorchRL's replay buffer"],
 )
-def test_eager_equals_compiled(settings, caplog):
-    caplog.set_level("DEBUG", "pgkit")
+def test_eager_equals_compiled(settings):
     results = []
     for compile in ("off", "on"):
         update, collector = agent(compile, updates_per_step=0.15, **settings)  # few, as rounding may change a draw
         metrics = train(update, collector)
         results.append((weights(update), metrics))
-        assert (update.compile_seconds > 0) == (compile == "on") and "cannot be recorded" not in caplog.text
+        assert (update.compile_seconds > 0) == (compile == "on")
+        for step in (update._plan.every, update._plan.critics):
+            assert step.native[0].rung == ("recorded and compiled" if compile == "on" else "eager")
     (a, eager), (b, compiled) = results
     torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-4)
     assert eager == pytest.approx(compiled, rel=1e-2, abs=1e-2)
@@ -82,6 +83,69 @@ def test_targets_follow_by_tau_and_nothing_trains_before_learning_starts():
     after, source = update.loss.target_qvalue_network_params.get(key), update.loss.qvalue_network_params.get(key)
     torch.testing.assert_close(after, before + 0.25 * (source - before))
     assert not torch.equal(after, before)
+
+
+def test_targets_have_rates_of_their_own():
+    """The innermost name in a parameter's path holds."""
+    update, collector = agent(tau={"qvalue_network": 0.25, "2": 0.5})
+    update.buffer.extend(collector.rollout())
+    update.buffer.extend(collector.rollout())
+    keys = {layer: ("module", "layers", layer, "weight") for layer in ("0", "2")}
+    before = {layer: update.loss.target_qvalue_network_params.get(key).clone() for layer, key in keys.items()}
+    update.train(1)
+    for layer, tau in (("0", 0.25), ("2", 0.5)):
+        after, source = (
+            params.get(keys[layer])
+            for params in (update.loss.target_qvalue_network_params, update.loss.qvalue_network_params)
+        )
+        torch.testing.assert_close(after, before[layer] + tau * (source - before[layer]))
+        assert not torch.equal(after, before[layer])
+    assert "targets move by 0.25 (qvalue_network) and 0.5 (2)" in str(update)
+    with pytest.raises(UserError, match="tau names 'encoder', which is no part of a target: they are qvalue_network"):
+        agent(tau={"qvalue_network": 0.25, "encoder": 0.5})
+    with pytest.raises(UserError, match=r"no rate for 'qvalue_network.module.layers.0.\w+': name 'qvalue_network"):
+        agent(tau={"2": 0.5})
+    with pytest.raises(UserError, match="tau of qvalue_network=2: give a number from 0 to 1"):
+        agent(tau={"qvalue_network": 2.0})
+
+
+@pytest.mark.parametrize("own", [True, False], ids=["pgkit's replay", "TorchRL's"])
+def test_accumulated_batches_are_one_larger_one(own):
+    finals = []
+    for batch_size, accumulate in ((32, 1), (16, 2)):
+        torch.manual_seed(0)
+        env = envs.make("Pendulum-v1")
+        actor = modules.deterministic_actor(env, (8,))
+        loss = losses.DDPGLoss(actor, modules.q_value(env, 1, (8,)))
+        theirs = TensorDictReplayBuffer(storage=LazyTensorStorage(500), batch_size=32)
+        update = updates.OffPolicyUpdate(
+            loss, data.ReplayBuffer(env, 500, seed=0) if own else theirs, torch.optim.SGD(loss.parameters(), lr=0.1),
+            batch_size=batch_size, accumulate=accumulate, learning_starts=64, updates_per_step=0.05, compile="off",
+        )  # fmt: skip
+        collector = collectors.VectorCollector(env, actor, frames_per_batch=64, compile="off")
+        torch.manual_seed(1)
+        metrics = [update(collector.rollout()) for _ in range(2)]
+        finals.append((weights(update), metrics[-1]))
+    torch.testing.assert_close(finals[0][0], finals[1][0], rtol=1e-4, atol=1e-5)
+    assert finals[0][1] == pytest.approx(finals[1][1], rel=1e-3)
+
+
+def test_an_augmentation_changes_what_the_loss_reads_and_not_what_is_stored():
+    seen = []
+
+    def augment(batch):
+        seen.append(batch["observation"].clone())
+        return batch.set("observation", torch.zeros_like(batch["observation"]))
+
+    update, collector = agent(augment=augment)
+    forward = update.loss.forward
+    read = []
+    update.loss.forward = lambda batch: (read.append(batch["observation"].clone()), forward(batch))[1]
+    train(update, collector, 3)
+    assert seen and all(x.abs().sum() > 0 for x in seen)
+    assert all((x == 0).all() for x in read[1:])  # the first is the check before the first step
+    stored = update.buffer.data["observations"]["observation"][:64]
+    assert (stored != 0).any(-1).all()
 
 
 @pytest.mark.parametrize(("rate", "expected"), [(1.0, 96), (0.5, 48), (0.3, 28)])

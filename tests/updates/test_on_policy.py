@@ -1,3 +1,4 @@
+import copy
 from functools import partial
 from typing import Any
 
@@ -9,10 +10,8 @@ from torchrl.objectives import ClipPPOLoss as TorchRLClipPPOLoss
 from torchrl.objectives.value import GAE as TorchRLGAE
 
 from pgkit import advantages, controllers, envs, losses, modules, updates
-from pgkit.compiling import record
 from pgkit.errors import UserError
-from pgkit.updates import optimizers
-from pgkit.updates.recorded import recorded_block
+from pgkit.updates.on_policy import CompiledAdvantage
 
 
 def make_agent(seed=0, dtype=torch.float32, loss_class=losses.ClipPPOLoss, optimizer=torch.optim.Adam, **kwargs):
@@ -33,8 +32,10 @@ def make_rollout(seed=0, dtype=torch.float32, rows=(2, 64)):
         return torch.randn(*rows, *size, generator=g, dtype=dtype)
 
     done = draw(1) > 2
-    next_td = {"observation": draw(3), "reward": draw(1), "done": done, "terminated": done}
-    data = {"observation": draw(3), "action": draw(1), "action_log_prob": draw() * 0.1 - 1, "next": next_td}
+    observation, final = draw(3), draw(3)
+    after = torch.where(done, final, torch.cat([observation[:, 1:], final[:, -1:]], 1))
+    next_td = {"observation": after, "reward": draw(1), "done": done, "terminated": done}
+    data = {"observation": observation, "action": draw(1), "action_log_prob": draw() * 0.1 - 1, "next": next_td}
     return TensorDict(data, rows)
 
 
@@ -71,50 +72,66 @@ def test_every_optimizer_compiles(optimizer):
     torch.testing.assert_close(parameters(a), parameters(b), rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize("mode", ["off", "on"])
-def test_several_optimizers_together_are_part_of_the_step(mode, monkeypatch):
+def test_several_optimizers_together_are_part_of_the_step(monkeypatch):
     def two(parameters, lr):
         return updates.Together(
             torch.optim.Adam(parameters[:5], lr=lr), torch.optim.SGD(parameters[5:], lr=0.1, momentum=0.9)
         )
 
-    update, twin = make_agent(compile=mode, optimizer=two, epochs=1), make_agent(optimizer=two, epochs=1)
+    update, twin = make_agent(compile="on", optimizer=two, epochs=1), make_agent(optimizer=two, epochs=1)
     monkeypatch.setattr(update.optimizer, "step", lambda: pytest.fail("stepped outside the graph"))
     for i in range(2):
         update.optimizer.param_groups[1]["lr"] = twin.optimizer.param_groups[1]["lr"] = 0.1 * (i + 1)
-        with monkeypatch.context() as patch:
-            patch.setattr(optimizers, "functional", lambda *_, **__: None)  # the twin's are torch's own steps
-            expected = twin(make_rollout(i))
-        assert update(make_rollout(i)) == pytest.approx(expected, rel=1e-4, abs=1e-5)
+        assert update(make_rollout(i)) == pytest.approx(twin(make_rollout(i)), rel=1e-4, abs=1e-5)
         torch.testing.assert_close(parameters(update), parameters(twin), rtol=1e-4, atol=1e-5)
 
 
-def test_a_recorded_advantage_follows_weights_and_settings_and_leaves_other_layouts_to_the_block():
+def test_a_compiled_advantage_follows_weights_settings_and_layouts():
     update = make_agent(compile="on", epochs=1, minibatch_size=None)
     update(make_rollout())
     block: Any = update.advantage
-    assert update._estimate is not None and update._estimate is not block
+    assert update._plan is not None
+    estimate = update._plan.block
+    assert isinstance(estimate, CompiledAdvantage) and estimate.native.rung == "recorded and compiled"
     other = make_rollout(3, rows=(64, 2)).transpose(0, 1)  # the same shape, other strides
     for rollout in (make_rollout(1), make_rollout(2), other):
         with torch.no_grad():
             for parameter in block.critic.parameters():
                 parameter.add_(0.1)
         block.gamma.mul_(0.9)
-        expected, got = block(rollout.clone()), update._estimate(rollout.clone(recurse=False))
+        expected, got = block(rollout.clone()), estimate(rollout.clone(recurse=False))
         for key in block.out_keys:
             torch.testing.assert_close(got[key], expected[key])
 
 
-def test_an_advantage_that_changes_its_buffers_is_not_recorded():
+def test_an_advantage_that_changes_its_buffers_keeps_doing_so():
     class Counting(advantages.GAE):
         def estimate(self, value, next_value, rollout):
             self.gamma.mul_(0.9)
             return super().estimate(value, next_value, rollout)
 
     block = Counting(modules.state_value(envs.make("Pendulum-v1")))
-    with pytest.raises(RuntimeError, match="changes a buffer"):
-        recorded_block(block, make_rollout())
-    assert block.gamma == torch.tensor(0.99)
+    estimate, twin = CompiledAdvantage(block, "on"), copy.deepcopy(block)
+    for i in range(3):
+        expected, got = twin(make_rollout(i)), estimate(make_rollout(i))
+        torch.testing.assert_close(got["advantage"], expected["advantage"])
+        torch.testing.assert_close(block.gamma, twin.gamma)
+
+
+def test_a_block_that_is_too_long_to_compile_is_recorded_or_refused(caplog):
+    class Loop(advantages.GAE):
+        def estimate(self, value, next_value, rollout):
+            total = torch.zeros_like(value[..., 0, :])
+            for t in range(value.shape[-2]):
+                total = total * self.gamma + value[..., t, :] * next_value[..., t, :]
+            return super().estimate(value + total.unsqueeze(-2), next_value, rollout)
+
+    block = Loop(modules.state_value(envs.make("Pendulum-v1")))
+    estimate = CompiledAdvantage(block, "auto")
+    torch.testing.assert_close(estimate(make_rollout())["advantage"], block(make_rollout())["advantage"])
+    assert estimate.native.rung == "recorded, not compiled" and "too many to compile soon" in caplog.text
+    with pytest.raises(UserError, match="the advantage block cannot be compiled .*too many to compile soon"):
+        CompiledAdvantage(block, "on")(make_rollout())
 
 
 def test_compiled_step_follows_normalizers_coefficients_and_learning_rate():
@@ -145,8 +162,7 @@ def test_compiled_step_follows_normalizers_coefficients_and_learning_rate():
 
 
 @pytest.mark.parametrize("loss_class", [losses.ClipPPOLoss, TorchRLClipPPOLoss])
-def test_eager_and_compiled_agree(loss_class, caplog):
-    caplog.set_level("DEBUG", "pgkit")
+def test_eager_and_compiled_agree(loss_class):
     eager, compiled = (make_agent(dtype=torch.float64, loss_class=loss_class, compile=mode) for mode in ("off", "on"))
     for i in range(20):
         a, b = (update(make_rollout(i, torch.float64)) for update in (eager, compiled))
@@ -154,7 +170,7 @@ def test_eager_and_compiled_agree(loss_class, caplog):
         assert a == pytest.approx(b, rel=1e-5, abs=1e-7)
     torch.testing.assert_close(parameters(eager), parameters(compiled), rtol=0, atol=1e-5)
     assert compiled.compile_seconds > 0 == eager.compile_seconds
-    assert "cannot be recorded" not in caplog.text
+    assert compiled._plan is not None and compiled._plan.native[0].rung == "recorded and compiled"
 
 
 def test_two_compiled_agents_in_one_process_do_not_mix():
@@ -202,32 +218,6 @@ def test_optimizer_steps_as_torch_would(optimizer):
             torch.testing.assert_close(torch.as_tensor(mine[i][key]).double(), torch.as_tensor(value).double())
 
 
-@pytest.mark.parametrize(
-    "make",
-    [
-        torch.optim.Adam,
-        partial(torch.optim.Adam, weight_decay=0.1, maximize=True, betas=(0.5, 0.9), eps=1e-3),
-        partial(torch.optim.AdamW, weight_decay=0.1),
-        partial(torch.optim.AdamW, amsgrad=True),
-    ],
-)
-def test_adam_as_it_is_compiled_is_torch_s(make):
-    params, twins = ([torch.linspace(-1, 1, n).double().requires_grad_() for n in (3, 5)] for _ in range(2))
-    optimizer, twin = make(params, lr=0.1), make(twins, lr=0.1)
-    whole, part = (optimizers.functional(optimizer, fused=False, params=ps) for ps in (params, params[:1]))
-    assert whole is not None and part is not None
-    for step in range(6):
-        grads = [(i + 2 - step) * torch.ones_like(p).cumsum(0) for i, p in enumerate(twins)]
-        both = step % 2 == 0  # counters differ between the parameters
-        for p, grad in zip(twins, grads, strict=True):
-            p.grad = grad if both or p is twins[0] else None
-        twin.step()
-        with torch.no_grad():
-            record(lambda *g, f=(whole if both else part)[0]: [f(list(g)), *g][1:], grads if both else grads[:1])
-    torch.testing.assert_close(params, twins, rtol=1e-12, atol=1e-12)
-    torch.testing.assert_close(optimizer.state_dict()["state"], twin.state_dict()["state"], check_dtype=False)
-
-
 def test_a_shorter_last_minibatch_counts_like_any_other():
     update = make_agent(minibatch_size=48, epochs=1)  # 128 rows: 48 + 48 + 32
     sizes, loss = [], update.loss.forward
@@ -246,6 +236,53 @@ def test_every_row_is_seen_once_an_epoch_and_in_another_order():
     expected = rollout["observation"].reshape(-1, 3).sort(0)[0]
     assert torch.equal(epochs[0].sort(0)[0], expected) and torch.equal(epochs[1].sort(0)[0], expected)
     assert not torch.equal(epochs[0], epochs[1])
+
+
+@pytest.mark.parametrize("compile", ["off", "on"])
+def test_accumulated_minibatches_are_one_larger_one(compile):
+    """Weighted by their rows: 128 rows are 48 + 48 + 32, or (24 + 24) + (24 + 24) + (24 + 8)."""
+    loss = partial(losses.ClipPPOLoss, normalize_advantage=False)
+    settings = {"dtype": torch.float64, "loss_class": loss}
+    update = make_agent(minibatch_size=24, accumulate=2, compile=compile, **settings)
+    twin = make_agent(minibatch_size=48, **settings)
+    for i in range(2):
+        got, expected = (agent(make_rollout(i, torch.float64)) for agent in (update, twin))
+        assert {name: got[name] for name in ("loss_objective", "grad_norm", "epochs")} == pytest.approx(
+            {name: expected[name] for name in ("loss_objective", "grad_norm", "epochs")}, rel=1e-6
+        )
+    torch.testing.assert_close(parameters(update), parameters(twin), rtol=0, atol=1e-6)
+    assert update._plan is not None
+    assert [native.seconds > 0 for native in update._plan.native] == [compile == "on"] * 2
+
+
+def test_something_between_gradient_and_optimizer():
+    settings = {"optimizer": torch.optim.SGD, "dtype": torch.float64, "max_grad_norm": None, "epochs": 1}
+    doubled, twin = make_agent(**settings), make_agent(**settings)
+    doubled.between = lambda grads: [2 * grad for grad in grads]
+    twin.optimizer.param_groups[0]["lr"] *= 2
+    for update in (doubled, twin):
+        update(make_rollout(0, torch.float64))
+    torch.testing.assert_close(parameters(doubled), parameters(twin), rtol=1e-12, atol=1e-12)
+
+
+def test_an_augmentation_is_part_of_the_step_and_draws_anew():
+    class Noise(torch.nn.Module):
+        scale = 0.5
+
+        def forward(self, batch):
+            return batch.set("observation", batch["observation"] + self.scale * torch.randn_like(batch["observation"]))
+
+    results = []
+    for compile in ("off", "on"):
+        update = make_agent(augment=Noise(), compile=compile, dtype=torch.float64, epochs=1)
+        torch.manual_seed(5)
+        metrics = [update(make_rollout(0, torch.float64)) for _ in range(2)]
+        results.append((metrics, parameters(update)))
+    (eager, expected), (compiled, got) = results
+    assert all(a == pytest.approx(b, rel=1e-5, abs=1e-7) for a, b in zip(eager, compiled, strict=True))
+    torch.testing.assert_close(got, expected, rtol=0, atol=1e-5)
+    plain = make_agent(dtype=torch.float64, epochs=1)
+    assert plain(make_rollout(0, torch.float64))["loss_critic"] != pytest.approx(eager[0]["loss_critic"], rel=1e-3)
 
 
 def test_target_kl_stops_after_the_epoch():

@@ -10,6 +10,7 @@ from torchrl.modules import DistributionalQValueActor
 from torchrl.objectives import DistributionalDQNLoss
 
 from pgkit import data, envs, losses, modules, updates
+from pgkit.checks import LossView, assembly
 from pgkit.errors import UserError
 from tests.updates.mistakes import MISTAKES, PAGE, Agent, ReplayAgent, message, page, section
 
@@ -42,9 +43,9 @@ def test_what_is_right_passes_and_leaves_no_trace():
 
     agent.loss.forward = counting
     state = torch.get_rng_state()
-    optimizer = torch.optim.Adam(agent.parameters)
-    update = updates.OnPolicyUpdate(agent.loss, agent.advantage, optimizer, epochs=1, compile="off", seed=0)
-    update._assemble(update._flatten(agent.rollout), 32, 64)
+    batch = agent.advantage(agent.rollout).reshape(-1)[:32]
+    names = assembly(LossView(agent.loss, agent.advantage), torch.optim.Adam(agent.parameters), batch)
+    assert names[:2] == ["loss_objective", "loss_entropy"]
     assert len(seen) == 1 and agent.loss.calls == 0 and torch.equal(state, torch.get_rng_state())
 
 

@@ -1,22 +1,22 @@
-"""When to compile, and compiling without dynamo."""
+"""Native code from torch: whatever of its interface is not stable, in one place.
+
+A torch whose private parts have moved raises here, and the door takes the next rung of its ladder.
+"""
 
 from __future__ import annotations
 
-import shutil
 import sys
+import types
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from logging import getLogger
 from typing import Any, cast
 
 import torch
 from torch import Tensor
-from torch.compiler import is_compiling, is_dynamo_compiling
+from torch.compiler import is_dynamo_compiling
 from torch.fx import GraphModule, Node
 from torch.fx.experimental.proxy_tensor import make_fx
 from torch.fx.subgraph_rewriter import replace_pattern
-
-from pgkit.errors import UserError
 
 # the same random numbers as eager code
 _OPTIONS: dict[str, Any] = {
@@ -28,38 +28,6 @@ _OPTIONS: dict[str, Any] = {
 # sums over a few action dimensions as loops, which are vectorized: written out, every row takes scalar code;
 # C++ around the kernels: Python there costs a small step a quarter of its time
 _CPU_OPTIONS: dict[str, Any] = {"unroll_reductions_threshold": 1, "cpp_wrapper": True}
-
-
-def check_compile(compile: str) -> None:
-    """A ``UserError`` for anything but ``auto``, ``on`` or ``off``."""
-    if compile not in ("auto", "on", "off"):
-        raise UserError(f"compile is 'auto', 'on' or 'off', not {compile!r}")
-
-
-def worth_compiling(compile: str, calls: float | None, least_calls: float) -> bool:
-    """Whether to compile, by the user's choice ``auto``, ``on`` or ``off``.
-
-    Args:
-        compile: ``auto`` compiles where there is a C++ compiler and enough calls are expected.
-        calls: expected number of calls; None: not known, and taken to be enough.
-        least_calls: number of calls that win the compile time back.
-    """
-    check_compile(compile)
-    if compile != "auto":
-        return compile == "on"
-    if shutil.which("g++") is None and shutil.which("clang++") is None:
-        getLogger("pgkit").warning("no C++ compiler (g++) found: running without torch.compile, about 3 times slower")
-        return False
-    return calls is None or calls >= least_calls
-
-
-def computed_once(x: Tensor) -> Tensor:
-    """``x`` without gradients, a few numbers that much larger operations read.
-
-    Compiled for a CPU, it is kept in memory: inductor's loops over the larger operations would compute it anew for
-    every vector, and two powers cost more than the rest of Adam.
-    """
-    return torch.ops._inductor_test.realize(x) if is_compiling() and x.device.type == "cpu" else x
 
 
 def record(function: Callable[..., Any], inputs: Sequence[Tensor]) -> GraphModule:
@@ -188,3 +156,31 @@ def _batch_products(graph: GraphModule) -> None:
 
     replace_pattern(graph, lambda x, y: aten.mm.default(x, y), product)
     replace_pattern(graph, lambda bias, x, y: aten.addmm.default(bias, x, y), biased)
+
+
+def torch_compiled(function: Callable[..., Any]) -> Callable[..., Any]:
+    """``torch.compile(function)`` as one graph with gradients, for arguments like those of its first call alone.
+
+    Later calls skip dynamo's guards.
+    """
+
+    def call(*arguments: Any) -> Any:
+        return function(*arguments)
+
+    # dynamo caches by code object: one of its own keeps each agent's graph apart from every other agent's
+    code = call.__code__.replace(co_name=f"call_{id(call)}")
+    own = types.FunctionType(code, call.__globals__, call.__name__, None, call.__closure__)
+    traced = torch.compile(own, fullgraph=True, dynamic=False, options={"fallback_random": True})
+    seen = False
+
+    def run(*arguments: Any) -> Any:
+        nonlocal seen
+        if seen:
+            with torch.compiler.set_stance("default", skip_guard_eval_unsafe=True):
+                return traced(*arguments)
+        with torch._dynamo.config.patch(trace_autograd_ops=True):
+            result = traced(*arguments)
+        seen = True
+        return result
+
+    return run

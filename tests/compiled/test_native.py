@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from pgkit.compiling import compile_record, record
+from pgkit.compiled.native import compile_record, record
 
 BIAS = torch.arange(4.0)
 WEIGHT = torch.nn.Parameter(torch.linspace(-1, 1, 12).reshape(3, 4))

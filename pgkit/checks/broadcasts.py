@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from math import prod
 from typing import Any
 
 from torch import Tensor
@@ -14,12 +15,12 @@ _ELEMENTWISE = {"add", "radd", "sub", "rsub", "mul", "rmul", "div", "truediv", "
 _ELEMENTWISE |= {"minimum", "maximum", "l1_loss", "mse_loss", "smooth_l1_loss", "huber_loss"}
 
 
-class TableError(UserError):
+class BroadcastError(UserError):
     """A ``(B,)`` and a ``(B, 1)`` became a ``(B, B)``."""
 
 
-class NoTables(TorchFunctionMode):
-    """Within it, an elementwise operation on a ``(B,)`` and a ``(B, 1)`` raises :class:`TableError`.
+class NoBroadcasts(TorchFunctionMode):
+    """Within it, an elementwise operation on a ``(B,)`` and a ``(B, 1)`` raises :class:`BroadcastError`.
 
     Args:
         name: of whose operations they are.
@@ -34,11 +35,12 @@ class NoTables(TorchFunctionMode):
     ) -> Any:
         name = getattr(func, "__name__", "").strip("_")
         if name in _ELEMENTWISE:
-            shapes = {tuple(x.shape) for x in args if isinstance(x, Tensor)}
-            rows = max((shape[0] for shape in shapes if shape), default=0)
-            if rows > 1 and shapes == {(rows,), (rows, 1)}:
-                raise TableError(
-                    f"{self.name} broadcasts a ({rows},) and a ({rows}, 1) to ({rows}, {rows}), in '{name}': "
+            shapes = sorted({tuple(x.shape) for x in args if isinstance(x, Tensor)}, key=len)
+            rows = shapes[0][0] if shapes and shapes[0] else 0
+            # (B,) with (B, 1), and of a group of one agent (B, 1) with (B, 1, 1)
+            if len(shapes) == 2 and shapes[1] == (*shapes[0], 1) and rows == prod(shapes[0]) > 1:
+                raise BroadcastError(
+                    f"{self.name} broadcasts a {shapes[0]} and a {shapes[1]} to {(rows, *shapes[0])}, in '{name}': "
                     "unsqueeze(-1) the first or squeeze(-1) the second (for a table that is meant, unsqueeze(0) the "
                     "first)"
                 )

@@ -1,0 +1,7 @@
+"""The one door to native code: record, compile, check, notice what changed, fall back."""
+
+from pgkit.compiled.constants import Constants
+from pgkit.compiled.door import Compiled, Mode, check_compile, choose, compiled
+from pgkit.compiled.trial import undone
+
+__all__ = ["Compiled", "Constants", "Mode", "check_compile", "choose", "compiled", "undone"]

@@ -1,0 +1,153 @@
+"""A report on results tables: tables in Markdown, learning curves with bands, profiles, who improves on whom."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pgkit.errors import UserError
+from pgkit.run import experiment, statistics
+from pgkit.run.plots import short_count
+
+Group = tuple[str, str]
+"""Recipe and settings: what a line of a report is about."""
+
+
+def report(tables: Sequence[Path], out: Path, x: str = "frames") -> str:
+    """Markdown about results tables, written to ``out``; figures go beside it.
+
+    Args:
+        tables: CSV files that ``pgkit experiment`` wrote.
+        out: a ``.md`` file. Figures are ``<stem>-curves.png`` and ``<stem>-profiles.png``.
+        x: ``frames`` or ``minutes``, the axis of the learning curves.
+
+    Raises:
+        UserError: a table is missing, damaged or empty.
+    """
+    rows = [row for table in tables for row in _present(table)]
+    curves = [r for t in tables for r in experiment.read(t.with_name(f"{t.stem}-curves.csv"), experiment.CURVE)]
+    scores = by_task(rows)
+    parts = ["# Results", *markdown(scores, rows)]
+    out.parent.mkdir(parents=True, exist_ok=True)
+    if curves:
+        _draw_curves(curves, out.with_name(f"{out.stem}-curves.png"), x)
+        parts.append(
+            f"![Learning curves]({out.stem}-curves.png)\n\n*Interquartile mean over seeds with its 95% interval.*"
+        )
+    if len({env for env, _ in scores}) > 1 or len({group for _, group in scores}) > 1:
+        _draw_profiles(scores, out.with_name(f"{out.stem}-profiles.png"))
+        parts.append(
+            f"![Performance profiles]({out.stem}-profiles.png)\n\n*Share of runs above a share of the best score.*"
+        )
+    text = "\n\n".join(parts) + "\n"
+    out.write_text(text, encoding="utf-8")
+    return text
+
+
+def _present(table: Path) -> list[dict[str, str]]:
+    if not (rows := experiment.read(table)):
+        raise UserError(f"{table} has no rows: is the path right, and has the experiment finished a run?")
+    return rows
+
+
+def by_task(rows: Sequence[Mapping[str, str]]) -> dict[tuple[str, Group], list[float]]:
+    """Final evaluations by environment and group, in the order of the tables.
+
+    Raises:
+        UserError: a score is no number.
+    """
+    scores: dict[tuple[str, Group], list[float]] = defaultdict(list)
+    for row in rows:
+        try:
+            scores[row["env"], (row["recipe"], row["settings"])].append(float(row["eval_mean"]))
+        except ValueError:
+            raise UserError(
+                f"eval_mean of {row['env']}, seed {row['seed']} is '{row['eval_mean']}', no number"
+            ) from None
+    return dict(scores)
+
+
+def markdown(scores: Mapping[tuple[str, Group], list[float]], rows: Sequence[Mapping[str, str]]) -> list[str]:
+    """The tables: each environment's interquartile mean, and the probability that one group improves on another."""
+    lines = ["| env | recipe | settings | seeds | mean | interquartile mean (95% interval) | minutes | frames/s |",
+             "|---|---|---|---|---|---|---|---|"]  # fmt: skip
+    for (env, (recipe, settings)), values in scores.items():
+        own = [r for r in rows if (r["env"], r["recipe"], r["settings"]) == (env, recipe, settings)]
+        estimate = statistics.interval(statistics.iqm, [values])
+        minutes, fps = (np.median([float(r[name]) for r in own]) for name in ("minutes", "fps"))
+        lines.append(
+            f"| {env} | {recipe} | {settings and f'`{settings}`'} | {len(values)} | {np.mean(values):,.1f} "
+            f"| {estimate} | {minutes:.1f} | {fps:,.0f} |"
+        )
+    return ["\n".join(lines), *_improvements(scores)]
+
+
+def _improvements(scores: Mapping[tuple[str, Group], list[float]]) -> list[str]:
+    groups = list(dict.fromkeys(group for _, group in scores))
+    if len(groups) < 2:
+        return []
+    lines = ["| better | than | environments | probability (95% interval) |", "|---|---|---|---|"]
+    for number, first in enumerate(groups):
+        for second in groups[number + 1 :]:
+            envs = [env for env, group in scores if group == first and (env, second) in scores]
+            if envs:
+                x, y = ([scores[env, group] for env in envs] for group in (first, second))
+                lines.append(f"| {name(first)} | {name(second)} | {len(envs)} | {statistics.improvement(x, y)} |")
+    return ["\n".join(lines)] if len(lines) > 2 else []
+
+
+def name(group: Group) -> str:
+    """Recipe and settings in one phrase."""
+    return " ".join(part for part in group if part)
+
+
+def _draw_curves(rows: Sequence[Mapping[str, str]], out: Path, x: str) -> None:
+    from matplotlib.figure import Figure
+
+    runs: dict[str, dict[Group, dict[str, list[tuple[float, float]]]]] = defaultdict(lambda: defaultdict(dict))
+    for r in rows:
+        group = runs[r["env"]][r["recipe"], r["settings"]]
+        group.setdefault(r["seed"], []).append((float(r[x]), float(r["eval_mean"])))
+    figure = Figure(figsize=(5.5 * min(len(runs), 3), 3.8 * -(-len(runs) // 3)), layout="constrained")
+    panels = figure.subplots(-(-len(runs) // 3), min(len(runs), 3), squeeze=False).flat
+    for axes, (env, groups) in zip(panels, runs.items(), strict=False):
+        for number, (group, curves) in enumerate(groups.items()):
+            _draw_band(axes, list(curves.values()), label=f"{name(group)} ({len(curves)})", color=f"C{number}")
+        axes.set(title=env, xlabel=x, ylabel="evaluation return")
+        axes.grid(alpha=0.3)
+        axes.legend(frameon=False, fontsize="small")
+        if x == "frames":
+            axes.xaxis.set_major_formatter(short_count)
+    figure.savefig(out, dpi=130)
+
+
+def _draw_band(axes: Any, curves: Sequence[Sequence[tuple[float, float]]], label: str, color: str) -> None:
+    longest = max(curves, key=len)
+    end = min(curve[-1][0] for curve in curves)
+    at = np.array([point for point, _ in longest if point <= end] or [end])
+    values = np.array([np.interp(at, *zip(*curve, strict=True)) for curve in curves])
+    bands = [statistics.interval(statistics.iqm, [column], samples=500) for column in values.T]
+    axes.plot(at, [band.value for band in bands], label=label, color=color, marker="o", markersize=3)
+    axes.fill_between(at, [b.low for b in bands], [b.high for b in bands], color=color, alpha=0.15, linewidth=0)
+
+
+def _draw_profiles(scores: Mapping[tuple[str, Group], list[float]], out: Path) -> None:
+    from matplotlib.figure import Figure
+
+    best: dict[str, float] = defaultdict(float)
+    for (env, _), values in scores.items():
+        best[env] = max(best[env], *np.abs(values))
+    thresholds = np.linspace(0, 1, 101)
+    figure = Figure(figsize=(5.5, 3.8), layout="constrained")
+    axes = figure.subplots()
+    for group in dict.fromkeys(group for _, group in scores):
+        tasks = [np.array(v) / (best[env] or 1.0) for (env, other), v in scores.items() if other == group]
+        axes.plot(thresholds, statistics.performance_profile(tasks, thresholds), label=name(group))
+    axes.set(xlabel="score / best score of the environment", ylabel="share of runs above", ylim=(0, 1.02))
+    axes.grid(alpha=0.3)
+    axes.legend(frameon=False, fontsize="small")
+    figure.savefig(out, dpi=130)
