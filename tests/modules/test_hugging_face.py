@@ -10,7 +10,6 @@ from pgkit.errors import UserError
 from tests.recipes.test_ppo import pgkit, rows
 
 
-
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """A llama of two layers, with a character tokenizer."""
