@@ -14,7 +14,7 @@ from typing import Any, Literal
 import torch
 from tensordict import TensorDict
 
-from pgkit import advantages, collectors, envs, losses, modules, run, updates
+from pgkit import advantages, collectors, controllers, envs, losses, modules, run, updates
 
 
 @dataclass
@@ -72,10 +72,10 @@ class Args(run.RunArgs):
     """Its attention heads."""
     model: Path | None = None
     """Hugging Face folder or GGUF file in place of the transformer; --init takes such a folder too."""
-    warm_start: float = run.setting(0.3, low=0, high=1)
+    warm_start: float = run.setting(0.35, low=0, high=1)
     """Learn from the task's imperfect teacher until so many of the held-out prompts are solved; 0: not at all."""
-    warm_steps: int = run.setting(5_000, low=0)
-    """Supervised steps at most, of 64 answers each."""
+    warm_steps: int = run.setting(4_000, low=1)
+    """Supervised steps at most, of 64 answers each; their learning rate falls to 0."""
     teacher: Literal["imperfect", "perfect"] = "imperfect"
     """perfect: the warm start learns from correct solutions, for comparison."""
 
@@ -129,7 +129,15 @@ def warm_start(args: Args, env: envs.Prompts, policy: modules.TokenPolicy) -> No
     optimizer = torch.optim.Adam(policy.parameters(), lr=3e-3, betas=(0.9, 0.95))
     loss = losses.SFTLoss(policy.actor)
     update = updates.OnPolicyUpdate(
-        loss, None, optimizer, epochs=1, minibatch_size=64, max_grad_norm=1.0, compile="off"
+        loss,
+        None,
+        optimizer,
+        epochs=1,
+        minibatch_size=64,
+        max_grad_norm=1.0,
+        schedules={"lr": controllers.linear(3e-3)},
+        total_frames=64 * args.warm_steps,
+        compile="off",
     )
     answer = env.task.solution if args.teacher == "perfect" else lambda prompt: env.task.teacher(prompt, random)
     for step in range(50, args.warm_steps + 1, 50):
