@@ -23,7 +23,7 @@ class Args(run.RunArgs):
 
     task: str = "addition"
     """addition, sorting, countdown, or reasoning_gym/NAME."""
-    total_frames: int = 400_000
+    total_frames: int = 500_000
     """Completions to train for."""
     eval_every: int = 40_960
     """Evaluate and save a checkpoint every so many completions; 0 = only at the end."""
