@@ -10,7 +10,7 @@ from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import ClipPPOLoss as TorchRLClipPPOLoss
 from torchrl.objectives.utils import ValueEstimators
 
-from pgkit import advantages, envs, losses, modules, updates
+from pgkit import advantages, envs, functional, losses, modules, updates
 
 
 def make_batch(actor, env, rows=32):
