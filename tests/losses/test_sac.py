@@ -301,6 +301,8 @@ def test_augmented_copies_share_the_mean_of_their_targets_and_the_actor_takes_th
     assert out["loss_qvalue"].item() == pytest.approx(19.5, abs=1e-4)
     assert out["loss_actor"].item() == pytest.approx(-2.0, abs=1e-5)
     torch.testing.assert_close(both["td_error"], torch.tensor([[1.5], [5.5]], dtype=torch.float64), atol=1e-4, rtol=0)
+    numbers = loss.target(both, torch.tensor([[4.0], [8.0]], dtype=torch.float64))  # a loss of one's own, without heads
+    assert numbers.tolist() == [[4.0], [4.0]]
     apart = by_hand(temperature=controllers.FixedTemperature(0.0))[0](both.clone())  # y = 3 and 5
     assert apart["loss_qvalue"].item() == pytest.approx((0.5 + 2.25 + 20.25) / 2, abs=1e-4)
 
