@@ -205,9 +205,9 @@ class QLoss(Loss):
         """
         keys, after = self.tensor_keys, batch["next"]
         reward, terminated = (after[key].reshape(batch.batch_size) for key in (keys.reward, keys.terminated))
-        steps = batch.get(keys.steps_to_next_obs, None)
-        steps = None if steps is None else steps.reshape(batch.batch_size)  # TorchRL's MultiStep drops the 1
-        gamma = self.gamma.to(next_value.dtype)  # gamma ** steps would be float64 for any
+        gamma, steps = self.gamma.to(next_value.dtype), batch.get(keys.steps_to_next_obs, None)
+        if steps is not None:  # TorchRL's MultiStep drops the 1; a power of whole numbers would be float32 for any
+            steps = steps.reshape(batch.batch_size).to(gamma.dtype)
         target: Any = bootstrap_target(reward, next_value, terminated, gamma, steps)
         if not self.augmented:
             return target
