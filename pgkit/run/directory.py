@@ -12,6 +12,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from pgkit.errors import UserError
 from pgkit.run.settings import RunArgs, read_json
 
@@ -119,7 +121,7 @@ def versions() -> dict[str, str]:
             found[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
             continue
-    return found
+    return {**found, "torch": str(torch.__version__)}  # with its build (+cpu, +cu130), which a wheel may not name
 
 
 def git_revision() -> str | None:
