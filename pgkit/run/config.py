@@ -17,6 +17,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, TypeVar
 
+import torch
+
 from pgkit import files
 from pgkit.cli import recipes
 from pgkit.errors import UserError
@@ -154,7 +156,7 @@ def versions() -> dict[str, str]:
             found[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
             continue
-    return found
+    return {**found, "torch": str(torch.__version__)}  # with its build (+cpu, +cu130), which a wheel may not name
 
 
 def git_revision() -> str | None:
