@@ -81,9 +81,8 @@ def read_json(path: Path) -> Any:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
         raise UserError(f"{path} cannot be read: {error}") from error
-    told = content.pop("sha256", None) if isinstance(content, dict) else None
-    if told is not None and told != _hash(content):
-        raise UserError(f"{path} is damaged, or was edited: its hash does not fit (an edited one has no sha256)")
+    if isinstance(content, dict) and {"sha256", "id"} & content.keys() and content.pop("sha256", "") != _hash(content):
+        raise UserError(f"{path} is damaged, or was edited: its hash does not fit")
     return content
 
 
