@@ -74,8 +74,8 @@ class Args(run.RunArgs):
     """Hugging Face folder or GGUF file in place of the transformer; --init takes such a folder too."""
     warm_start: float = run.setting(0.3, low=0, high=1)
     """Learn from the task's imperfect teacher until so many of the held-out prompts are solved; 0: not at all."""
-    warm_steps: int = run.setting(1_500, low=0)
-    """Supervised steps at most."""
+    warm_steps: int = run.setting(5_000, low=0)
+    """Supervised steps at most, of 64 answers each."""
     teacher: Literal["imperfect", "perfect"] = "imperfect"
     """perfect: the warm start learns from correct solutions, for comparison."""
 
@@ -126,17 +126,17 @@ def agent(args: Args, env: envs.Prompts) -> run.Agent:
 def warm_start(args: Args, env: envs.Prompts, policy: modules.TokenPolicy) -> None:
     """Supervised learning from the task's teacher, until enough held-out prompts are solved."""
     test, random = args.prompt_env(500, args.seed, held_out=True), Random(args.seed)
-    optimizer = torch.optim.Adam(policy.parameters(), lr=3e-3, betas=(0.9, 0.98))
+    optimizer = torch.optim.Adam(policy.parameters(), lr=3e-3, betas=(0.9, 0.95))
     loss = losses.SFTLoss(policy.actor)
     update = updates.OnPolicyUpdate(
-        loss, None, optimizer, epochs=1, minibatch_size=256, max_grad_norm=1.0, compile="off"
+        loss, None, optimizer, epochs=1, minibatch_size=64, max_grad_norm=1.0, compile="off"
     )
     answer = env.task.solution if args.teacher == "perfect" else lambda prompt: env.task.teacher(prompt, random)
-    for step in range(10, args.warm_steps + 1, 10):
-        texts = env.draw(2560)
+    for step in range(50, args.warm_steps + 1, 50):
+        texts = env.draw(50 * 64)
         metrics = update(env.rows(texts, [answer(text) for text in texts]))
         solved = share_solved(test, policy)
-        if step % 50 == 0:
+        if step % 250 == 0 or solved >= args.warm_start:
             print(f"warm start: step {step}, loss {metrics['loss_sft']:.2f}, {solved:.1%} of held-out prompts solved")
         if solved >= args.warm_start:
             break

@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from pgkit.envs import Prompts
-from pgkit.errors import UserError, check_whole_number, within
+from pgkit.errors import UserError, check_whole_number
 
 
 class TokenCollector:
@@ -55,7 +55,8 @@ class TokenCollector:
         reference: Any = None,
     ) -> None:
         check_whole_number(1, total_frames=total_frames)
-        within(0, 1, top_p=top_p)
+        if not 0 < top_p <= 1:
+            raise UserError(f"top_p={top_p}: give a number above 0, at most 1")
         if group_size < 2:
             raise UserError(f"group_size={group_size}: a completion is measured against others, give at least 2")
         if env.vocab_size > actor.network.vocab_size:

@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from random import Random
 from typing import Any, Literal
 
+import numpy as np
 import torch
 from tensordict import TensorDict
 from torch import Tensor
@@ -113,6 +114,7 @@ class Prompts:
     """
 
     resume: Literal["exact", "new episodes"] = "exact"
+    masks = False
 
     def __init__(
         self,
@@ -140,6 +142,7 @@ class Prompts:
         self.observation_spec = Composite(observation=observed, shape=(batch,))
         self.action_spec = Composite(action=acted, shape=(batch,))
         self.reward_spec = Composite(reward=Unbounded((batch, 1)), shape=(batch,))
+        self.info_spec = Composite(shape=(batch,))
         self.done_spec = Composite(done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=(batch,))
         self.episode_reward: Entries = {"reward": torch.zeros(batch, 1)}
         self.step_count = torch.zeros(batch, dtype=torch.int64)
@@ -150,11 +153,12 @@ class Prompts:
         """Of the prompts drawn from now on."""
         self._random.seed(seed)
 
-    def reset(self, seed: int | None = None) -> Entries:
-        """Draws ``N`` prompts."""
+    def reset(self, seed: int | None = None, rows: Tensor | None = None) -> Entries:
+        """Draws ``N`` prompts, or those where ``rows [N]`` is set."""
         if seed is not None:
             self._random.seed(seed)
-        self.texts = self.draw(self.num_envs)
+        anew = [True] * self.num_envs if rows is None or not self.texts else rows.tolist()
+        self.texts = [self._draw() if new else text for new, text in zip(anew, self.texts or anew, strict=True)]
         return {"observation": self.encode(self.texts)}
 
     def step(self, action: Entries) -> Step:
@@ -237,9 +241,15 @@ class Prompts:
     def state_dict(self) -> dict[str, Any]:
         return {"random": self._random.getstate(), "texts": list(self.texts)}
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: dict[str, Any]) -> Entries:
+        """Restores :meth:`state_dict`; the prompts drawn last."""
         self._random.setstate(state["random"])
         self.texts = list(state["texts"])
+        return {"observation": self.encode(self.texts)} if self.texts else self.reset()
+
+    def to_env(self, actions: np.ndarray) -> np.ndarray:
+        """Completions as they are."""
+        return actions
 
     def close(self) -> None: ...
 

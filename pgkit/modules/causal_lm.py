@@ -66,11 +66,12 @@ class Transformer(nn.Module):
             raise UserError(f"width={width} over heads={heads}: give a width that is a multiple of {2 * heads}")
         self.vocab_size, self.context, self.heads = vocab_size, context, heads
         self.embedding = nn.Embedding(vocab_size, width)
-        nn.init.normal_(self.embedding.weight, std=0.02)
+        nn.init.normal_(self.embedding.weight, std=0.1)
         self.blocks = nn.ModuleList(Block(width, heads) for _ in range(layers))
         self.norm = nn.RMSNorm(width)
         size = width // heads
-        angle = torch.outer(torch.arange(context), 10_000.0 ** -(torch.arange(0, size, 2) / size))
+        base = max(100.0, 10.0 * context)  # the slowest rotation; slower ones would tell no two places here apart
+        angle = torch.outer(torch.arange(context), base ** -(torch.arange(0, size, 2) / size))
         self.register_buffer("cos", angle.cos(), persistent=False)
         self.register_buffer("sin", angle.sin(), persistent=False)
 

@@ -106,5 +106,5 @@ def test_what_does_not_fit():
         collectors.TokenCollector(env, actor, group_size=1)
     with pytest.raises(UserError, match="temperature=0: give a number above 0"):
         collectors.TokenCollector(env, actor, temperature=0)
-    with pytest.raises(UserError, match="top_p=1.5: give a number from 0 to 1"):
-        collectors.TokenCollector(env, actor, top_p=1.5)
+    with pytest.raises(UserError, match="top_p=0: give a number above 0, at most 1"):
+        collectors.TokenCollector(env, actor, top_p=0)

@@ -96,13 +96,21 @@ def test_it_is_a_simulator_of_one_step():
     assert env.episode_reward["reward"].flatten().tolist() == [1, 0, 0] and env.step_count.tolist() == [1, 1, 1]
 
 
+def test_some_rows_are_drawn_anew():
+    env = envs.prompts("addition", 3, seed=4)
+    env.reset()
+    before = list(env.texts)
+    env.reset(rows=torch.tensor([False, True, False]))
+    assert [a == b for a, b in zip(before, env.texts, strict=True)] == [True, False, True]
+
+
 def test_a_state_goes_on_where_it_was():
     env = envs.prompts("countdown", 4, seed=3)
     env.reset()
     state = env.state_dict()
     after = env.reset()["observation"]
     other = envs.prompts("countdown", 4, seed=9)
-    other.load_state_dict(state)
+    assert torch.equal(other.load_state_dict(state)["observation"], env.encode(state["texts"]))
     assert torch.equal(other.reset()["observation"], after)
     assert torch.equal(env.reset(seed=3)["observation"], envs.prompts("countdown", 4, seed=3).reset()["observation"])
 

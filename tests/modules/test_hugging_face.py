@@ -7,6 +7,7 @@ from tensordict import TensorDict
 
 from pgkit import advantages, collectors, envs, losses, modules, updates
 from pgkit.errors import UserError
+from tests.recipes.test_ppo import pgkit, rows
 
 
 @pytest.fixture(scope="module")
@@ -68,3 +69,10 @@ def test_what_does_not_fit(folder, tmp_path):
         modules.hugging_face(
             folder, envs.prompts("countdown", tokenizer=envs.Characters("".join(map(chr, range(33, 128)))))
         )
+
+
+def test_the_recipe_begins_with_a_folder(folder, tmp_path):
+    flags = ["--prompts", 4, "--group-size", 2, "--total-frames", 8, "--eval-episodes", 500, "--compile", "off"]
+    out = pgkit("run", "grpo", "--init", folder, *flags, "--run-dir", tmp_path / "run")
+    assert "warm start" not in out.stdout and len(rows(tmp_path / "run")) == 1
+    assert (tmp_path / "run" / "checkpoints" / "latest.pt").exists()
