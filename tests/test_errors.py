@@ -10,7 +10,7 @@ from torch import nn
 
 from pgkit import advantages, collectors, controllers, data, envs, losses, modules, updates
 from pgkit.envs.layout import layout
-from pgkit.envs.vector import action_spec
+from pgkit.envs.spaces import action_spec
 from pgkit.errors import UserError, whole, within
 
 ENV = envs.make("Pendulum-v1")

@@ -17,10 +17,11 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
+from pgkit.envs import vector_of
 from pgkit.errors import UserError
 from pgkit.run import checkpoint, directory, seeding
 from pgkit.run.clock import Clock
-from pgkit.run.evaluate import check_playable, evaluate
+from pgkit.run.evaluate import evaluate
 from pgkit.run.metrics import Metrics, averages, column, finished_episodes, read_csv, warm
 from pgkit.run.plots import plot
 from pgkit.run.policy import describe_env
@@ -190,7 +191,7 @@ class Run:
                         f"track(eval_env=...) is called as eval_env(num_envs=, seed=), this one cannot be ({error}): "
                         "functools.partial(envs.make, env_id)"
                     ) from error
-            check_playable(self._eval)
+            self._eval = vector_of(self._eval)
         return self._eval
 
     def _evaluate(self, row: Mapping[str, float]) -> dict[str, float]:
