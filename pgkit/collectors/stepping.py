@@ -183,8 +183,8 @@ def _nested(entries: dict[tuple[str, ...], Tensor], dims: int) -> TensorDictBase
 def _check(tensors: dict[Any, Tensor], env: VectorEnv) -> None:
     """A ``UserError`` for numbers that are not finite, and for masks that allow no action."""
     for key, _ in _specs(env.observation_spec):
-        for x, where in ((tensors[key], key), (tensors["next", *_path(key)], ("next", *_path(key)))):
-            _check_finite(x, where)
+        for where in (("next", *_path(key)), key):
+            _check_finite(tensors[where], where)
         if _path(key)[-1] == "action_mask":
             spec = env.full_action_spec[*_path(key)[:-1], "action"]
             if not all(x.any(-1).all() for x in choices(spec, tensors[key])):
