@@ -63,7 +63,8 @@ class Simulator(Protocol):
         info_spec: further entries that a step gives.
         resume: what :meth:`state_dict` promises: every environment ``exact`` as it was, or ``new episodes``.
         masks: whether :attr:`Step.mask` is given.
-        episode_reward: return so far of the episodes that the last step belonged to, before any reset; keyed as rewards.
+        episode_reward: return so far of the episodes that the last step belonged to, before any reset; by the rewards'
+            keys.
         step_count: their length so far, int64 ``[N]``.
     """
 
@@ -90,8 +91,8 @@ class Simulator(Protocol):
         """Steps every environment; those whose episode ends begin the next one."""
         ...
 
-    def to_env(self, action: np.ndarray) -> np.ndarray:
-        """Actions ``[B, ...]`` of a policy as one environment takes them: within bounds, of its type."""
+    def to_env(self, actions: np.ndarray, /) -> np.ndarray:
+        """A policy's actions ``[B, ...]`` as one environment takes them: within bounds, of its type."""
         ...
 
     def state_dict(self) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from itertools import pairwise
 from typing import Any
 
 import torch
@@ -19,13 +20,12 @@ MASK: Key = ("collector", "mask")
 
 
 def allocate(steps: int, env: VectorEnv, outputs: Entries) -> Entries:
-    """Buffers ``[steps, N, ...]`` for a rollout, from the specs and from examples ``[N, ...]`` of the policy's results."""
-    after = {(*_path(key),): spec for key, spec in [*_specs(env.info_spec), *_specs(env.observation_spec)]}
-    made: dict[Any, Any] = {**dict(_specs(env.observation_spec)), **{key: x for key, x in outputs.items()}}
+    """Buffers ``[steps, N, ...]`` for a rollout, from the specs and from examples ``[N, ...]`` of the outputs."""
+    made: dict[Any, Any] = {**dict(_specs(env.observation_spec)), **outputs}
     if STATE in outputs:
         flag = torch.zeros(env.num_envs, 1, dtype=torch.bool, device=env.device)
         made |= {"recurrent_state": outputs[STATE], "is_init": flag, ("next", "is_init"): flag}
-    made |= {("next", *path): spec for path, spec in after.items()}
+    made |= {("next", *_path(key)): x for key, x in [*_specs(env.observation_spec), *_specs(env.info_spec)]}
     for key, spec in _specs(env.full_reward_spec):
         made |= {("next", *_path(key)): spec, ("next", *_total(key)): spec}
     made |= {("next", *_path(key)): spec for key, spec in _specs(env.full_done_spec) if _path(key)[-1] != "done"}
@@ -33,10 +33,7 @@ def allocate(steps: int, env: VectorEnv, outputs: Entries) -> Entries:
     if env.masks:
         made[MASK] = torch.ones(env.num_envs, dtype=torch.bool)
     device = env.device or torch.device("cpu")
-    return {
-        key: torch.zeros(steps, *x.shape, dtype=x.dtype, device=device)
-        for key, x in made.items()
-    }
+    return {key: torch.zeros(steps, *x.shape, dtype=x.dtype, device=device) for key, x in made.items()}
 
 
 class Share:
@@ -150,7 +147,7 @@ def regroup(states: Sequence[dict[str, Any]], bounds: Sequence[int]) -> list[dic
         )
     rows = [row for simulator in simulators for row in simulator["rows"]]
     kept = {key: torch.cat([state["memory"][key] for state in states]) for key in states[0]["memory"]}
-    parts = [(a - bounds[0], b - bounds[0]) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
+    parts = [(a - bounds[0], b - bounds[0]) for a, b in pairwise(bounds)]
     return [
         {"simulator": simulators[0] | {"rows": rows[a:b]}, "memory": {key: x[a:b] for key, x in kept.items()}}
         for a, b in parts
@@ -161,7 +158,7 @@ def as_rollout(buffers: Entries, env: VectorEnv) -> TensorDictBase:
     """The buffers ``[T, N, ...]`` as a TensorDict ``[N, T]``, without a copy, and ``("next", ..., "done")``."""
     tensors: dict[Any, Tensor] = {key: x.transpose(0, 1) for key, x in buffers.items()}
     for key in [key for key in tensors if _path(key)[-1] == "terminated"]:
-        tensors[*key[:-1], "done"] = tensors[key] | tensors[*key[:-1], "truncated"]
+        tensors[(*key[:-1], "done")] = tensors[key] | tensors[(*key[:-1], "truncated")]
     _check(tensors, env)
     return _nested({_path(key): x for key, x in tensors.items()}, 2)
 
@@ -186,13 +183,14 @@ def _check(tensors: dict[Any, Tensor], env: VectorEnv) -> None:
         for where in (("next", *_path(key)), key):
             _check_finite(tensors[where], where)
         if _path(key)[-1] == "action_mask":
-            spec = env.full_action_spec[*_path(key)[:-1], "action"]
+            spec = env.full_action_spec[(*_path(key)[:-1], "action")]
             if not all(x.any(-1).all() for x in choices(spec, tensors[key])):
                 raise UserError(
                     "the environment's action_mask allows no action in some state: it must allow at least one"
                 )
     for key, _ in _specs(env.full_reward_spec):
-        _check_finite(tensors["next", *_path(key)], ("next", *_path(key)))
+        where = ("next", *_path(key))
+        _check_finite(tensors[where], where)
 
 
 def _check_finite(x: Tensor, key: Key) -> None:

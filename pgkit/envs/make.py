@@ -132,13 +132,10 @@ def _function(env_id: Any, kwargs: dict[str, Any]) -> Callable[..., Any]:
 
 def _share(function: Callable[..., Any], settings: Settings, first: int, count: int, seed: int) -> Simulator:
     """The environments ``first`` to ``first + count``: what the function makes decides how."""
-    try:
-        names = set(inspect.signature(function).parameters)
-    except (TypeError, ValueError):
-        names = set()
     own_seed = seed if first == 0 else episode_seed(seed, first, 0)
     given = {"num_envs": count, "seed": own_seed, "device": settings.device}
-    made = function(**{name: value for name, value in given.items() if name in names})
+    names = _named(function) - {name for name, value in given.items() if value is None}
+    made = function(**{name: given[name] for name in names & given.keys()})
     if isinstance(made, EnvBase | GymVectorEnv):
         simulator = _simulator(made, own_seed, first, settings)
         if simulator.num_envs != count:
@@ -149,9 +146,21 @@ def _share(function: Callable[..., Any], settings: Settings, first: int, count: 
     rest = []
     for i in range(first + 1, first + count):
         given["seed"] = episode_seed(seed, i, 0)
-        rest.append(function(**{name: value for name, value in given.items() if name in names}))
+        rest.append(function(**{name: given[name] for name in names & given.keys()}))
     envs = [_one(env, settings) for env in (made, *rest)]
     return Gymnasium(envs, seed, first, settings.flatten, settings.info)
+
+
+def _named(function: Any) -> set[str]:
+    """The arguments that a function or class names and that are not given yet."""
+    taken: set[str] = set()
+    while isinstance(function, partial):
+        taken |= function.keywords.keys()
+        function = function.func
+    try:
+        return set(inspect.signature(function.__init__ if isinstance(function, type) else function).parameters) - taken
+    except (TypeError, ValueError):  # built in
+        return set()
 
 
 def _simulator(env: EnvBase | GymVectorEnv, seed: int, first: int, settings: Settings) -> Simulator:

@@ -24,9 +24,7 @@ class Observations:
     def __init__(self, entries: Sequence[Entry], num_envs: int) -> None:
         self.entries = entries
         self.arrays = [np.zeros((num_envs, *entry.shape), entry.dtype) for entry in entries]
-        self.tensors: Entries = {
-            entry.key: torch.from_numpy(x) for entry, x in zip(entries, self.arrays, strict=True)
-        }
+        self.tensors: Entries = {entry.key: torch.from_numpy(x) for entry, x in zip(entries, self.arrays, strict=True)}
         self._rows = [(entry.read, x, entry.shape) for entry, x in zip(entries, self.arrays, strict=True)]
 
     def write(self, row: int, obs: Any) -> None:
@@ -144,4 +142,3 @@ def flags(num_envs: int) -> Composite:
 def rewards(num_envs: int) -> Composite:
     """The ``reward_spec`` of one number an environment."""
     return Composite(reward=Unbounded((num_envs, 1), dtype=torch.float32), shape=(num_envs,))
-

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterable
 from typing import Any, Literal
 
@@ -48,7 +49,7 @@ class Torch:
         self._one = not env.batch_size
         self.num_envs = n = env.batch_size.numel()
         self.device = torch.device(env.device or "cpu")
-        self.resume: Literal["exact", "new episodes"] = _promise(env)
+        self.resume: Literal["exact", "new episodes"] = getattr(type(_inner(env)), "resume", "new episodes")
         observed, infos = self._many(env.full_observation_spec), Composite(shape=(n,))
         keys = {_key(key): isinstance(observed[key].zero(), Tensor) for key in observed.keys(True, True)}
         if missing := [key for key in info if not keys.get(key)]:
@@ -98,11 +99,17 @@ class Torch:
             self._data = self.env.reset()
             self._untouched = True
             self._begin_counts()
-        elif rows is not None and (rows := rows & ~self._begun).any():
+        elif rows is not None:
+            return self._reset_rows(rows & ~self._begun)
+        return self._entries(self._data, self.observation_spec)
+
+    def _reset_rows(self, rows: Tensor) -> Entries:
+        assert self._data is not None
+        if rows.any():
             again = self._data.copy()
             for key in self.env.reset_keys:
                 done = again.get((*as_path(key)[:-1], "done"))
-                again.set(key, rows.view(-1, *[1] * (done.ndim - 1)).expand(self.num_envs, *done.shape[1:]))
+                again.set(key, rows.reshape(-1, *[1] * (done.ndim - 1)).expand(self.num_envs, *done.shape[1:]))
             self._data = self.env.reset(again)
             self._begun = self._begun | rows
         return self._entries(self._data, self.observation_spec)
@@ -151,7 +158,8 @@ class Torch:
 
     def state_dict(self) -> dict[str, Any]:
         """The environment's own state, and with ``resume = "exact"`` what its next step is made with."""
-        state: dict[str, Any] = {"steps": self._steps, "env": self.env.state_dict()}
+        own = [copy.deepcopy(env.state_dict()) for env in dict.fromkeys((self.env, _inner(self.env)))]
+        state: dict[str, Any] = {"steps": self._steps, "env": own}
         if self.resume == "exact":
             state |= {
                 "data": None if self._data is None else self._data.clone().to_dict(),
@@ -161,10 +169,11 @@ class Torch:
 
     def load_state_dict(self, state: dict[str, Any]) -> Entries:
         """Goes on exactly, or begins new episodes with a seed of their own."""
-        seed = self.seed
-        self._restart(episode_seed(seed, self.first, state["steps"]) if state["steps"] else seed)
+        seed, begins = self.seed, self.resume == "new episodes" and state["steps"]
+        self._restart(episode_seed(seed, self.first, state["steps"]) if begins else seed)
         self.seed, self._steps = seed, state["steps"]
-        self.env.load_state_dict(state["env"])
+        for env, own in zip(dict.fromkeys((self.env, _inner(self.env))), state["env"], strict=True):
+            env.load_state_dict(own)
         if self.resume == "exact" and state["data"] is not None:
             self._data = TensorDict(state["data"], batch_size=self.env.batch_size, device=self.env.device)
             self.episode_reward, self.step_count, self._begun = state["counts"]
@@ -177,10 +186,11 @@ class Torch:
             self.env.close()
 
 
-def _promise(env: EnvBase) -> Literal["exact", "new episodes"]:
+def _inner(env: EnvBase) -> EnvBase:
+    """The environment under its transforms, whose ``state_dict`` leaves it out."""
     while isinstance(env, TransformedEnv):
         env = env.base_env
-    return getattr(type(env), "resume", "new episodes")
+    return env
 
 
 def _key(key: Any) -> Key:

@@ -42,7 +42,8 @@ class Net(torch.nn.Linear):
 
 def main(args):
     with run.Run(args, recipe="walk") as log:
-        log.track(policy=TensorDictModule(Net(args.width, 1), ["observation"], ["action"]), eval_env=partial(envs.make, Env))
+        policy = TensorDictModule(Net(args.width, 1), ["observation"], ["action"])
+        log.track(policy=policy, eval_env=partial(envs.make, Env))
         for frames in range(log.frames + 10, args.total_frames + 1, 10):
             log.step(frames)
 

@@ -1,3 +1,5 @@
+from typing import Any
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -393,7 +395,8 @@ def test_workers_with_a_convolution_give_the_same_numbers_and_evaluate_their_own
     for workers in (1, 2, 4):
         actor, collector = conv_agent(workers)
         rollouts.append(torch.stack([collector.rollout(), collector.rollout()]))
-        held = actor if workers == 1 else collector._workers._actor
+        pool: Any = collector._workers
+        held = actor if workers == 1 else pool._actor
         counted = next(part for part in held.modules() if isinstance(part, Counted))
         assert counted.rows == 16 // workers
         collector.shutdown()
@@ -442,7 +445,9 @@ def test_random_actions_do_not_depend_on_the_workers():
 class Skewed(TensorDictModuleBase):
     """Draws from a gamma distribution, by rejection."""
 
-    in_keys, out_keys = ["observation"], ["action"]
+    def __init__(self):
+        super().__init__()
+        self.in_keys, self.out_keys = ["observation"], ["action"]
 
     def forward(self, tensordict):
         shape = tensordict["observation"].abs() + 1

@@ -40,7 +40,7 @@ class Steps(gym.Env):
 class TorchSteps(EnvBase):
     """The same in torch: slot ``i`` ends after ``i + 2`` steps."""
 
-    batch_locked = True
+    at: torch.Tensor
 
     def __init__(self, num_envs: int = 2) -> None:
         super().__init__(batch_size=(num_envs,))
@@ -125,9 +125,16 @@ def test_every_simulator_tells_the_same_story(kind):
 def test_next_step_masks_the_rows_whose_action_is_ignored():
     simulator = envs.make(MODES["next step"]()).simulator
     simulator.reset()
-    masks = [simulator.step({"action": torch.zeros(2, 1)}).mask.tolist() for _ in range(6)]
+    masks: list[Any] = [simulator.step({"action": torch.zeros(2, 1)}).mask for _ in range(6)]
     # slot 0 ends after 2 steps and is reset in the third, slot 1 after 3 and in the fourth
-    assert masks == [[True, True], [True, True], [False, True], [True, False], [True, True], [False, True]]
+    assert [mask.tolist() for mask in masks] == [
+        [True, True],
+        [True, True],
+        [False, True],
+        [True, False],
+        [True, True],
+        [False, True],
+    ]
 
 
 @pytest.mark.parametrize("kind", [*MODES, "one by one"])
