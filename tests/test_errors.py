@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 from pgkit import advantages, collectors, controllers, data, envs, losses, modules, updates
-from pgkit.envs.spaces import action_spec
+from pgkit.envs.spaces import action_spec, observation_entries
 from pgkit.errors import UserError, whole, within
 
 ENV = envs.make("Pendulum-v1")

@@ -220,7 +220,7 @@ def _other(x: Tensor) -> Tensor:
 
 def example(env: VectorEnv, actor: TensorDictModuleBase) -> Entries:
     """The actor's outputs for observations of zeros, by key, checked against the environment's action spec."""
-    entries, device = env.observation_spec.zero(), env.observation_spec.device
+    keys, entries, device = output_keys(actor), env.observation_spec.zero(), env.observation_spec.device
     data = TensorDict({**entries, **memory(actor, env.num_envs, device)}, batch_size=(env.num_envs,))
     missing = [key for key in actor.in_keys if key not in data.keys(True)]
     if missing:
@@ -249,7 +249,7 @@ def example(env: VectorEnv, actor: TensorDictModuleBase) -> Entries:
                 f"the actor's action is {tuple(action.shape[1:])} {action.dtype}, the environment's "
                 f"{tuple(spec.shape[1:])} {spec.dtype}; {misfit}"
             )
-    return {key: out[key].to(env.device or "cpu") for key in output_keys(actor)}
+    return {key: out[key].to(env.device or "cpu") for key in keys}
 
 
 def check_types(actor: TensorDictModuleBase, data: Any) -> None:

@@ -160,10 +160,12 @@ def as_rollout(buffers: Entries, env: VectorEnv) -> TensorDictBase:
     for key in [key for key in tensors if _path(key)[-1] == "terminated"]:
         tensors[(*key[:-1], "done")] = tensors[key] | tensors[(*key[:-1], "truncated")]
     _check(tensors, env)
-    return _nested({_path(key): x for key, x in tensors.items()}, 2)
+    return _nested({_path(key): x for key, x in tensors.items()}, env.groups)
 
 
-def _nested(entries: dict[tuple[str, ...], Tensor], dims: int) -> TensorDictBase:
+def _nested(
+    entries: dict[tuple[str, ...], Tensor], shapes: dict[tuple[str, ...], torch.Size], at: tuple[str, ...] = ()
+) -> TensorDictBase:
     """Nested TensorDicts; checking each entry costs a tenth of a millisecond a rollout, so none is."""
     source: dict[str, Any] = {}
     groups: dict[str, dict[tuple[str, ...], Tensor]] = {}
@@ -173,8 +175,9 @@ def _nested(entries: dict[tuple[str, ...], Tensor], dims: int) -> TensorDictBase
         else:
             groups.setdefault(path[0], {})[path[1:]] = x
     for name, group in groups.items():
-        source[name] = _nested(group, dims)
-    return TensorDict._new_unsafe(source=source, batch_size=next(iter(entries.values())).shape[:dims])
+        source[name] = _nested(group, shapes, () if name == "next" else (*at, name))
+    batch = next(iter(entries.values())).shape[:2]
+    return TensorDict._new_unsafe(source=source, batch_size=batch + shapes.get(at, torch.Size()))
 
 
 def _check(tensors: dict[Any, Tensor], env: VectorEnv) -> None:

@@ -140,7 +140,7 @@ class VectorCollector:
             self._workers = None
         if self._workers is None:
             start = time.perf_counter()
-            self._constants = Constants(self.actor)
+            self._constants, self._beside = Constants(self.actor), Beside(self.actor, self.env)
             self._workers = Workers(self.env, self._beside.actor, self._steps, self._outputs, self._compile)
             self.compile_seconds += time.perf_counter() - start
             if state is not None:

@@ -100,11 +100,15 @@ def make(
     return env
 
 
-def vector_of(env: EnvBase) -> VectorEnv:
+def vector_of(env: Any) -> VectorEnv:
     """What :func:`make` makes of a TorchRL environment; what it made stays as it is.
 
     Any other's seed is drawn from torch's global generator.
     """
+    if not isinstance(env, EnvBase):
+        raise UserError(
+            f"pgkit plays what envs.make gives, a {type(env).__name__} is none of that: envs.make(id or function)"
+        )
     return env if isinstance(env, VectorEnv) else make(env, seed=int(torch.randint(2**31, ())))
 
 

@@ -9,6 +9,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Composite
 from torchrl.envs import EnvBase
 
+from pgkit.envs.numpy_entries import as_path
 from pgkit.errors import UserError
 from pgkit.seams import Entries, MakeSimulator, Simulator
 
@@ -25,6 +26,9 @@ class VectorEnv(EnvBase):
         seed: every environment's seed is derived from it.
         workers: processes that collect with this environment (1: the calling process).
         splits: whether ``make`` makes any share, and in other processes too.
+
+    Attributes:
+        groups: of every group of agents, by its path, the dimensions after the environments'.
     """
 
     env_id: str = "unnamed environment"
@@ -44,6 +48,9 @@ class VectorEnv(EnvBase):
                 probe.observation_spec, probe.action_spec, probe.reward_spec, probe.done_spec, probe.info_spec,
             )
         )  # fmt: skip
+        specs = (self.observation_spec, self.full_action_spec, self.full_reward_spec, self.full_done_spec)
+        groups = [(as_path(key), spec[key]) for spec in specs for key in spec.keys(True)]
+        self.groups = {path: group.shape[1:] for path, group in groups if isinstance(group, Composite)}
         self._simulator: Simulator | None = probe if workers == 1 else None
         if workers > 1:
             probe.close()
@@ -75,6 +82,9 @@ class VectorEnv(EnvBase):
         out = TensorDict({}, batch_size=self.batch_size, device=self.device)
         for key, x in entries.items():
             out.set(key, x.clone())
+        for path, shape in self.groups.items():
+            if (group := out.get(path, None)) is not None:
+                group.batch_size = (*self.batch_size, *shape)
         return out
 
     def _set_seed(self, seed: int | None) -> None:

@@ -22,7 +22,7 @@ from pgkit.errors import UserError
 from pgkit.run import checkpoint, directory, seeding
 from pgkit.run.clock import Clock
 from pgkit.run.evaluate import evaluate
-from pgkit.run.metrics import Metrics, averages, column, finished_episodes, read_csv, warm
+from pgkit.run.metrics import Metrics, averages, column, finished_episodes, finished_infos, read_csv, warm
 from pgkit.run.plots import plot
 from pgkit.run.policy import describe_env
 from pgkit.run.progress import Live
@@ -137,6 +137,7 @@ class Run:
             raise RuntimeError("call track(policy=..., eval_env=...) before the first step(...)")
         self._episodes.extend(finished_episodes(rollout))
         self._recent += [metrics] if metrics else []
+        self._recent += [infos] if (infos := finished_infos(rollout)) else []
         due = frames >= self.args.total_frames
         if self.args.eval_every:
             due |= frames // self.args.eval_every > self.frames // self.args.eval_every

@@ -7,8 +7,11 @@ import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.data import Bounded, Composite, Unbounded
+from tensordict.nn import TensorDictModule
+from torch import nn
+from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import Compose, EnvBase, RewardScaling, StepCounter, TransformedEnv
+from torchrl.envs.utils import check_env_specs
 
 from pgkit import advantages, collectors, envs, losses, modules, run, updates
 from tests.collectors.test_vector import equal
@@ -155,3 +158,54 @@ def test_a_run_trains_evaluates_and_resumes(make, tmp_path, capsys, caplog):
 
 def evaluation(num_envs: int, seed: int) -> envs.VectorEnv:
     return envs.make(transformed, num_envs, seed=seed)
+
+
+class Team(EnvBase):
+    """Two agents under the name ``agents``, with a reward each and one end for both, after 5 steps."""
+
+    def __init__(self, num_envs: int) -> None:
+        super().__init__(batch_size=(num_envs,))
+        n, flag = num_envs, Categorical(2, (num_envs, 1), dtype=torch.bool)
+        group = Composite(observation=Unbounded((n, 2, 3)), shape=(n, 2))
+        self.observation_spec = Composite(agents=group, shape=(n,))
+        self.action_spec = Composite(agents=Composite(action=Bounded(-1, 1, (n, 2, 1)), shape=(n, 2)), shape=(n,))
+        self.reward_spec = Composite(agents=Composite(reward=Unbounded((n, 2, 1)), shape=(n, 2)), shape=(n,))
+        self.done_spec = Composite(done=flag, terminated=flag, shape=(n,))
+
+    def _observe(self) -> TensorDict:
+        agents = torch.arange(2.0).view(1, 2, 1).expand(*self.batch_size, 2, 3) + self.t.view(-1, 1, 1)
+        return TensorDict({"agents": TensorDict({"observation": agents}, (*self.batch_size, 2))}, self.batch_size)
+
+    def _reset(self, tensordict: Any = None, **kwargs: Any) -> TensorDict:
+        self.t = torch.zeros(self.batch_size)
+        return self._observe()
+
+    def _step(self, tensordict: Any) -> TensorDict:
+        self.t = self.t + 1
+        out, done = self._observe(), (self.t == 5).unsqueeze(-1)
+        out["agents", "reward"] = tensordict["agents", "action"] + torch.tensor([[10.0], [20.0]])
+        return out.set("done", done).set("terminated", done.clone())
+
+    def _set_seed(self, seed: int | None) -> None: ...
+
+
+def test_a_group_of_agents_lies_under_its_name():
+    net = TensorDictModule(nn.Linear(3, 1), [("agents", "observation")], [("agents", "action")])
+    env = envs.make(Team, num_envs=3, seed=1)
+    check_env_specs(env)
+    collector = collectors.VectorCollector(env, net, frames_per_batch=21, init_random_frames=1, compile="off")
+    drawn, rollout = collector.rollout(), collector.rollout()
+    assert rollout["agents"].batch_size == rollout["next", "agents"].batch_size == (3, 7, 2)
+    assert rollout["next", "done"].shape == (3, 7, 1) and rollout["next", "step_count"].shape == (3, 7, 1)
+    for made in (drawn, rollout):
+        expected = made["agents", "action"].clamp(-1, 1) + torch.tensor([[10.0], [20.0]])
+        torch.testing.assert_close(made["next", "agents", "reward"], expected)
+    torch.testing.assert_close(rollout["agents", "action"], net(rollout.clone())["agents", "action"])
+    totals = torch.cat([drawn, rollout], 1)["next", "agents", "reward"][:, :5].sum(1)
+    torch.testing.assert_close(drawn["next", "agents", "episode_reward"][:, 4], totals)
+    assert torch.cat([drawn, rollout], 1)["next", "done"][0, :, 0].nonzero().flatten().tolist() == [4, 9]
+    returns, lengths = run.play(net, envs.make(Team, num_envs=3), episodes=3)
+    assert lengths.tolist() == [5, 5, 5]
+    obs = torch.arange(2.0).view(1, 2, 1) + torch.arange(5.0).view(5, 1, 1).expand(5, 2, 3)
+    expected = (net.module(obs).clamp(-1, 1) + torch.tensor([[10.0], [20.0]])).sum(0).mean().item()
+    np.testing.assert_allclose(returns, [expected] * 3, rtol=1e-5)
