@@ -5,7 +5,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
-from pgkit.run.metrics import Metrics, averages, column, finished_episodes, read_csv
+from pgkit.run.metrics import Metrics, averages, column, finished_episodes, finished_infos, read_csv
 
 
 def write(run_dir: Path, *rows: dict[str, float], upto: int = 0) -> Path:
@@ -68,3 +68,14 @@ def test_a_line_that_was_cut_short_is_left_out(tmp_path: Path):
     path = tmp_path / "metrics.csv"
     path.write_text("frames,a,b\n10,1,2\n20,3,4\n3")
     assert [row["frames"] for row in read_csv(path)[1]] == ["10", "20"]
+
+
+def test_declared_infos_of_finished_episodes_are_logged_under_their_names():
+    done = torch.tensor([[[True], [False], [True]], [[False], [True], [False]]])
+    success = torch.tensor([[[1.0], [9.0], [0.0]], [[9.0], [1.0], [9.0]]])
+    length = torch.tensor([[[4.0], [9.0], [float("nan")]], [[9.0], [8.0], [9.0]]])
+    after = {"done": done, "is_success": success, "episode": {"l": length}, "observation": success, "reward": success}
+    rollout = TensorDict({"observation": success, "next": after}, [2, 3])
+    assert finished_infos(rollout) == {"rollout/success_rate": 2 / 3, "rollout/episode_l": 6.0}
+    assert finished_infos(TensorDict({"next": {"done": done & False, "is_success": success}}, [2, 3])) == {}
+    assert finished_infos(None) == {}
