@@ -18,7 +18,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import OrnsteinUhlenbeckProcessModule
 
 from pgkit.collectors.noise import Streams, census, fed
-from pgkit.compiled import Mode, compiled, undone
+from pgkit.compiled import Compiled, Mode, compiled, undone
 from pgkit.envs import VectorEnv
 from pgkit.envs.seeding import episode_seed
 from pgkit.errors import UserError
@@ -186,6 +186,12 @@ def trace(act: Act, inputs: Sequence[Tensor], actor: TensorDictModuleBase, mode:
     Args:
         mode: of :func:`pgkit.compiled.compiled`; ``off`` records all the same, which changes no bit.
     """
+    with torch.no_grad():
+        return native_policy(act, inputs, actor, mode).bind(None, *inputs)
+
+
+def native_policy(act: Act, inputs: Sequence[Tensor], actor: TensorDictModuleBase, mode: Mode) -> Compiled:
+    """The function behind the door to native code, not bound yet; see :func:`trace`."""
 
     def function(_: None, *inputs: Tensor) -> tuple[Tensor, ...]:
         return act(*inputs)
@@ -194,14 +200,12 @@ def trace(act: Act, inputs: Sequence[Tensor], actor: TensorDictModuleBase, mode:
         return [(None, *(_other(x, seed, spread) for x in inputs)) for seed, spread in enumerate((0.1, 1.0, 10.0))]
 
     mode = "record" if mode == "off" else mode
-    with torch.no_grad():
-        with _LeavesTorch() as leaves:
-            undone(actor.buffers(), lambda: act(*inputs))
-        if leaves.seen:
-            getLogger("pgkit").info("the policy computes outside torch: it is called as it is, several times slower")
-            mode = "off"
-        native = compiled(function, watch={"the actor": actor}, others=others, mode=mode, name="the policy")
-        return native.bind(None, *inputs)
+    with torch.no_grad(), _LeavesTorch() as leaves:
+        undone(actor.buffers(), lambda: act(*inputs))
+    if leaves.seen:
+        getLogger("pgkit").info("the policy computes outside torch: it is called as it is, several times slower")
+        mode = "off"
+    return compiled(function, watch={"the actor": actor}, others=others, mode=mode, name="the policy")
 
 
 class _LeavesTorch(TorchFunctionMode):
