@@ -147,7 +147,7 @@ class ToEnv:
     def __call__(self, actions: np.ndarray) -> np.ndarray:
         if self.low is not None and self.high is not None:
             clipped = np.minimum(np.maximum(actions, self.low), self.high)
-            rounded = np.rint(clipped) if np.issubdtype(self.dtype, np.integer) else clipped
+            rounded = np.rint(clipped) if self.dtype.kind in "iu" else clipped
             return rounded.astype(self.dtype, copy=False)
         return actions.astype(self.dtype) if self.dtype is not None else np.add(actions, self.start)
 
