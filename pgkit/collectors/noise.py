@@ -168,10 +168,16 @@ class _Source:
         return (low + (unit * (high - low)).floor()).to(self.settings.get("dtype", torch.int64))
 
 
+def _scaled(x: Tensor, shift: Any, scale: Any) -> Tensor:
+    """``shift + scale * x``, without operations that change nothing."""
+    x = x if isinstance(scale, int | float) and scale == 1 else scale * x
+    return x if isinstance(shift, int | float) and shift == 0 else shift + x
+
+
 def _normal(source: _Source, mean: Any, std: Any = 1.0, *shape: Any) -> Tensor:
     if shape:
-        return mean + std * source.new("normal", shape[0])
-    return mean + std * source.like("normal", mean if isinstance(mean, Tensor) else std)
+        return _scaled(source.new("normal", shape[0]), mean, std)
+    return _scaled(source.like("normal", mean if isinstance(mean, Tensor) else std), mean, std)
 
 
 def _multinomial(source: _Source, weights: Tensor, samples: int, replacement: bool = False) -> Tensor:
@@ -202,11 +208,11 @@ _RULES: dict[Any, Callable[..., Any]] = {
     _ATEN.randn: lambda source, shape: source.new("normal", shape),
     _ATEN.randn_like: lambda source, x: source.like("normal", x),
     _ATEN.normal: _normal,
-    _ATEN.normal_: lambda source, x, mean=0.0, std=1.0: x.copy_(mean + std * source.like("normal", x)),
+    _ATEN.normal_: lambda source, x, mean=0.0, std=1.0: x.copy_(_scaled(source.like("normal", x), mean, std)),
     _ATEN.rand: lambda source, shape: source.new("uniform", shape),
     _ATEN.rand_like: lambda source, x: source.like("uniform", x),
-    _ATEN.uniform_: lambda source, x, low=0.0, high=1.0: x.copy_(low + (high - low) * source.like("uniform", x)),
-    _ATEN.exponential_: lambda source, x, rate=1.0: x.copy_(source.like("exponential", x) / rate),
+    _ATEN.uniform_: lambda source, x, low=0.0, high=1.0: x.copy_(_scaled(source.like("uniform", x), low, high - low)),
+    _ATEN.exponential_: lambda source, x, rate=1.0: x.copy_(_scaled(source.like("exponential", x), 0, 1 / rate)),
     _ATEN.multinomial: _multinomial,
     _ATEN.bernoulli: lambda source, x, p=None: (source.like("uniform", x) < (x if p is None else p)).to(x.dtype),
     _ATEN.bernoulli_: _bernoulli_,

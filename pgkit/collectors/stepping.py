@@ -70,7 +70,8 @@ class Share:
         self._memory = memory(actor, simulator.num_envs, simulator.device)
         self._keys = [*self._observed, *self._memory]
         self._now, self._decided = _rows(buffers, self._keys), _rows(buffers, self._outputs)
-        self._next = _rows(buffers, [("next", *_path(key)) for key in self._after()])
+        counted = buffers | {("next", "step_count"): buffers["next", "step_count"].squeeze(-1)}
+        self._next = _rows(counted, [("next", *_path(key)) for key in self._after()])
         self._mask = buffers[MASK].unbind(0) if simulator.masks else None
         spec = simulator.action_spec
         padded = padded_rows(simulator.num_envs, num_envs)
@@ -92,31 +93,31 @@ class Share:
         act = function_of(actor, self._keys)
         self._policy = RowPolicy(act, self._now[0], self._num_envs, self._first, self._seed, actor, mode)
 
-    @torch.no_grad()
+    @torch.inference_mode()
     def collect(self, step: int, random: bool = False) -> None:
         """Steps the environments through the buffers; ``step`` counts their steps since the beginning."""
         policy, simulator = self._random if random else self._policy, self.simulator
         if self._fresh is None:
             self._fresh = simulator.reset()
-        fresh, remembered = self._fresh, self._memory
+        fresh, remembered, observed = self._fresh, self._memory, self._observed
+        actions = [(key, self._outputs.index(key)) for key in self._actions]
+        state = self._outputs.index(STATE) if remembered else None
         with policy.steps(step, self._steps) as noise:
             for now, decided, after, drawn, t in zip(
                 self._now, self._decided, self._next, noise, range(self._steps), strict=True
             ):
-                _copy(now, [fresh[key] for key in self._observed])
-                if remembered:
-                    _copy(now[len(self._observed) :], remembered.values())
-                outputs = dict(zip(self._outputs, policy(now, drawn), strict=True))
-                _copy(decided, outputs.values())
-                made = simulator.step({key: outputs[key] for key in self._actions})
-                _copy(after, [
-                    *[made.next[key] for key in self._observed], *made.reward.values(), *made.terminated.values(),
+                torch._foreach_copy_(now, [*[fresh[key] for key in observed], *remembered.values()])
+                outputs = policy(now, drawn)
+                torch._foreach_copy_(decided, outputs)
+                made = simulator.step({key: outputs[at] for key, at in actions})
+                torch._foreach_copy_(after, [
+                    *[made.next[key] for key in observed], *made.reward.values(), *made.terminated.values(),
                     *made.truncated.values(), *made.info.values(), *simulator.episode_reward.values(),
-                    simulator.step_count.unsqueeze(-1),
+                    simulator.step_count,
                 ])  # fmt: skip
                 fresh = made.fresh
                 if remembered:
-                    remembered = {"is_init": made.begun().unsqueeze(-1), "recurrent_state": outputs[STATE]}
+                    remembered = {"is_init": made.begun().unsqueeze(-1), "recurrent_state": outputs[state]}
                 if self._mask is not None and made.mask is not None:
                     self._mask[t].copy_(made.mask)
         self._fresh, self._memory = fresh, remembered
@@ -212,11 +213,6 @@ def _rows(buffers: Entries, keys: Iterable[Key]) -> list[list[Tensor]]:
     """For each step, the rows of these entries."""
     columns = [buffers[key[0] if isinstance(key, tuple) and len(key) == 1 else key].unbind(0) for key in keys]
     return [list(row) for row in zip(*columns, strict=True)]
-
-
-def _copy(rows: Sequence[Tensor], values: Iterable[Tensor]) -> None:
-    for row, x in zip(rows, values, strict=False):
-        row.copy_(x)
 
 
 def _specs(spec: Any) -> list[tuple[Any, Any]]:

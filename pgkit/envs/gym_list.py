@@ -18,6 +18,8 @@ from pgkit.envs.seeding import episode_seed
 from pgkit.errors import UserError
 from pgkit.seams import Entries, Step
 
+WRONG = (ValueError, TypeError, KeyError)  # what writing an observation raises that is not of its space
+
 
 class Gymnasium:
     """A :class:`~pgkit.seams.Simulator` of ``gym.Env`` objects in this process, on NumPy.
@@ -82,7 +84,7 @@ class Gymnasium:
         seed = episode_seed(self.seed, self.first + i, int(self._episode[i]))
         first_ones = self._episode[i] < 2  # whose resets are looked at closely
         result = checked_reset(self.envs[i], seed) if first_ones else self.envs[i].reset(seed=seed)
-        self._write(self._fresh, i, result[0], "reset")
+        self._write(i, result[0], "reset")
         self._begun[i] = True
         self._since[i] = len(self._taken)
         oldest = int(self._since.min())
@@ -90,10 +92,10 @@ class Gymnasium:
             del self._taken[:oldest]
             self._since -= oldest
 
-    def _write(self, observations: Observations, i: int, obs: Any, method: str) -> None:
+    def _write(self, i: int, obs: Any, method: str) -> None:
         try:
-            observations.write(i, obs)
-        except (ValueError, TypeError, KeyError) as error:
+            self._fresh.write(i, obs)
+        except WRONG as error:
             raise misshapen(self.envs[i], method, error) from error
 
     def step(self, action: Entries) -> Step:
@@ -103,16 +105,21 @@ class Gymnasium:
             self._begun[:] = False
         totals, actions = self._totals, self.to_env(action["action"].numpy())
         given = actions.copy()  # an environment may change its action in place, the history stays
-        if self._infos.tensors:
-            self._infos.clear()
+        reward, terminated, truncated, looks = totals.reward, totals.terminated, totals.truncated, not self._stepped
+        infos, write = self._infos if self._infos.tensors else None, self._next.write
+        if infos is not None:
+            infos.clear()
         for i, env in enumerate(self.envs):
             result = env.step(given[i])
-            if not (self._stepped and plain(result)):
+            if looks or not plain(result):
                 check_step(env, actions[i], result)
-            obs, totals.reward[i], totals.terminated[i], totals.truncated[i], info = result
-            self._write(self._next, i, obs, "step")
-            if self._infos.tensors:
-                self._infos.write(i, info)
+            obs, reward[i], terminated[i], truncated[i], info = result
+            try:
+                write(i, obs)
+            except WRONG as error:
+                raise misshapen(env, "step", error) from error
+            if infos is not None:
+                infos.write(i, info)
         self._taken.append(actions)
         self._stepped = True
         totals.count()
@@ -140,7 +147,7 @@ class Gymnasium:
             self._begin(i)
             for action in row["actions"]:
                 obs, reward, *_ = env.step(action.copy())
-                self._write(self._fresh, i, obs, "step")
+                self._write(i, obs, "step")
                 self._totals.episode_reward[i] += np.float32(reward)
                 self._begun[i] = False
             self._totals.step_count[i] = len(row["actions"])

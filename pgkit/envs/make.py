@@ -6,6 +6,7 @@ import inspect
 import sys
 from collections.abc import Callable
 from functools import partial
+from logging import getLogger
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -153,6 +154,7 @@ def _share(function: Callable[..., Any], settings: Settings, first: int, count: 
     for i in range(first + 1, first + count):
         given["seed"] = episode_seed(seed, i, 0)
         rest.append(function(**{name: given[name] for name in names & given.keys()}))
+    _warn_of_statistics(made)
     envs = [_one(env, settings) for env in (made, *rest)]
     return Gymnasium(envs, seed, first, settings.flatten, settings.info)
 
@@ -180,6 +182,17 @@ def _simulator(env: EnvBase | GymVectorEnv, seed: int, first: int, settings: Set
         return GymnasiumVector(env, seed, first, settings.flatten, settings.info)
     env = env if settings.device is None else env.to(settings.device)
     return Torch(env, seed, first, settings.info)
+
+
+def _warn_of_statistics(env: Any) -> None:
+    """Says that a wrapper's statistics are its own: a resume and an evaluation begin with none."""
+    while isinstance(env, gym.Wrapper):
+        if isinstance(env, gym.wrappers.NormalizeObservation | gym.wrappers.NormalizeReward):
+            getLogger("pgkit").warning(
+                "%s keeps statistics that evaluation and a resume begin anew: use --normalize-obs "
+                "(modules.ObsNormalizer) and --scale-returns, which are part of the checkpoint", type(env).__name__,
+            )  # fmt: skip
+        env = env.env
 
 
 def _one(env: Any, settings: Settings) -> gym.Env:

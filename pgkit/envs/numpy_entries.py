@@ -31,7 +31,7 @@ class Observations:
         """Writes what one environment returned; ``ValueError`` where it is not of its space's shape."""
         for read, array, shape in self._rows:
             x = read(obs)
-            if np.shape(x) != shape:
+            if (x.shape if type(x) is np.ndarray else np.shape(x)) != shape:
                 raise ValueError(f"shape {np.shape(x)}, its space says {shape}")
             array[row] = x
 

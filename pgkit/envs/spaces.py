@@ -60,12 +60,14 @@ def observation_entries(space: gym.Space, flatten: bool = True) -> list[Entry]:
         UserError: the space cannot become a vector; or with ``flatten=False``, it is no Dict, or an entry has a name
             that rollouts use.
     """
+    if not isinstance(space, gym.Space):
+        raise UserError(f"the observation space is a {type(space).__name__}, no gymnasium.spaces.Space: set one")
     if not flatten:
         return _apart(space)
     if isinstance(space, spaces.Box):
         image = space.dtype == np.uint8 and len(space.shape) > 1
         return [_box("observation", space, np.uint8 if image else np.float32, _itself)]
-    if not space.is_np_flattenable:
+    if not _flattens(space):
         raise UserError(f"the observation space {space} cannot become one vector: encode it in a wrapper")
     parts = space.spaces if isinstance(space, spaces.Dict) else {}
     if images := [name for name, x in parts.items() if x.dtype == np.uint8 and len(x.shape or ()) > 1]:
@@ -82,6 +84,13 @@ def observation_entries(space: gym.Space, flatten: bool = True) -> list[Entry]:
     if parts and all(isinstance(x, _ARRAYS) for x in parts.values()):
         return [Entry("observation", size, np.float32, partial(_join, tuple(parts)), partial(_join_all, tuple(parts)))]
     return [Entry("observation", size, np.float32, partial(spaces.flatten, space), None)]
+
+
+def _flattens(space: gym.Space) -> bool:
+    try:
+        return space.is_np_flattenable
+    except NotImplementedError:  # a space of another library
+        return False
 
 
 def _apart(space: gym.Space) -> list[Entry]:
@@ -147,7 +156,7 @@ class ToEnv:
     def __call__(self, actions: np.ndarray) -> np.ndarray:
         if self.low is not None and self.high is not None:
             clipped = np.minimum(np.maximum(actions, self.low), self.high)
-            rounded = np.rint(clipped) if np.issubdtype(self.dtype, np.integer) else clipped
+            rounded = np.rint(clipped) if self.dtype.kind in "iu" else clipped
             return rounded.astype(self.dtype, copy=False)
         return actions.astype(self.dtype) if self.dtype is not None else np.add(actions, self.start)
 

@@ -90,6 +90,7 @@ class Torch:
         self.step_count = torch.zeros(self.num_envs, dtype=torch.int64, device=self.device)
         self._begun = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
 
+    @torch.inference_mode(False)
     @torch.no_grad()
     def reset(self, seed: int | None = None, rows: Tensor | None = None) -> Entries:
         """As :meth:`pgkit.seams.Simulator.reset`."""
@@ -114,13 +115,14 @@ class Torch:
             self._begun = self._begun | rows
         return self._entries(self._data, self.observation_spec)
 
+    @torch.inference_mode(False)
     @torch.no_grad()
     def step(self, action: Entries) -> Step:
         """As :meth:`pgkit.seams.Simulator.step`."""
         assert self._data is not None
         data = self._data
         for key, x in action.items():
-            x = x.clamp(*self._bounds[key]) if key in self._bounds else x
+            x = x.clamp(*self._bounds[key]) if key in self._bounds else x.clone()
             data.set(key, x.squeeze(0) if self._one else x)
         done, self._data = self.env.step_and_maybe_reset(data)
         self._untouched = False

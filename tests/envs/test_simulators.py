@@ -237,6 +237,26 @@ def test_what_a_function_returns_decides_what_it_is():
         envs.make(TorchSteps(), num_envs=4)
 
 
+def test_spaces_and_wrappers_that_do_not_fit_are_named(caplog):
+    class Mission(spaces.Space):
+        """A space of another library."""
+
+    class Spoken(Steps):
+        observation_space = Mission()  # pyright: ignore[reportAssignmentType]
+
+    class Lacking(Steps):
+        observation_space = None  # pyright: ignore[reportAssignmentType]
+
+    with pytest.raises(UserError, match="cannot become one vector"):
+        envs.make(Spoken)
+    with pytest.raises(UserError, match="the observation space is a NoneType"):
+        envs.make(Lacking)
+    envs.make(Steps)
+    assert not caplog.text
+    envs.make(lambda: gym.wrappers.TransformReward(gym.wrappers.NormalizeReward(Steps()), float))
+    assert "NormalizeReward keeps statistics that evaluation and a resume begin anew" in caplog.text
+
+
 def test_dm_control_objects_are_taken():
     from dm_control import suite
 
