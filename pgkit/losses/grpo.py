@@ -126,7 +126,7 @@ class GRPOLoss(Loss):
         else:
             self.convert_to_functional(critic_network, "critic_network")
         for name, value in coefficients.items():
-            self.register_coeff_buffer(name, value)
+            self.register_coeff_buffer(name, value, dtype=torch.float64)
         self.surrogate, self.ratio, self.kl = surrogate, ratio, kl
         self.aggregation, self.max_length = AGGREGATIONS[aggregation], max_length
         self.entropy_bonus, self.has_reference = entropy_bonus, bool(kl_to_ref_coeff)
@@ -174,18 +174,18 @@ class GRPOLoss(Loss):
         keys, each = self.tensor_keys, token_weights(mask, dtype=log_prob.dtype)
         if self.has_reference:
             divergence = kl_estimate(torch.where(mask, batch[keys.ref_log_probs] - log_prob, 0.0), self.kl)
-            out["loss_kl_to_ref"] = self.kl_to_ref_coeff * total(weights, divergence, mask)
+            out["loss_kl_to_ref"] = total(weights, self.kl_to_ref_coeff * divergence, mask)
             out["kl_to_ref"] = total(each, divergence.detach(), mask)
         if self.entropy_bonus:
             entropy = dist.entropy()
-            out["loss_entropy"] = -self.entropy_coeff * total(weights, entropy, mask)
+            out["loss_entropy"] = -total(weights, self.entropy_coeff * entropy, mask)
             out["entropy"] = total(each, entropy.detach(), mask)
         if self.critic_network is not None:
             with self.critic_network_params.to_module(self.critic_network):
                 value = self.critic_network(batch.select(*self.critic_network.in_keys))[keys.value]
             target = batch[keys.value_target]
             same_shape(value=value, value_target=target)
-            out["loss_critic"] = self.critic_coeff * total(each, (value - target).square().squeeze(-1), mask)
+            out["loss_critic"] = total(each, self.critic_coeff * (value - target).square().squeeze(-1), mask)
             out["explained_variance"] = explained_variance(value.detach(), target, mask.unsqueeze(-1))
 
     def _add_metrics(self, out: TensorDict, mask: Tensor, token_log_ratio: Tensor, log_ratio: Tensor) -> None:

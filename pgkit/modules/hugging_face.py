@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,11 @@ def hugging_face(model: str | Path | nn.Module, env: Vocabulary, *, temperature:
     Raises:
         UserError: transformers is not installed, or there is no model there.
     """
-    loaded = model if isinstance(model, nn.Module) else _load("AutoModelForCausalLM", Path(model), dtype=torch.float32)
+    loaded = (
+        model
+        if isinstance(model, nn.Module)
+        else _load(lambda library: library.AutoModelForCausalLM, Path(model), dtype=torch.float32)
+    )
     network = HuggingFaceNetwork(loaded)
     if env.vocab_size > network.vocab_size:
         raise UserError(
@@ -36,10 +40,12 @@ def hugging_face(model: str | Path | nn.Module, env: Vocabulary, *, temperature:
 
 def hugging_face_tokenizer(model: str | Path | Any) -> HuggingFaceTokenizer:
     """The tokenizer of a folder or ``.gguf`` file, or one of transformers, for ``envs.prompts(tokenizer=)``."""
-    return HuggingFaceTokenizer(_load("AutoTokenizer", Path(model)) if isinstance(model, str | Path) else model)
+    return HuggingFaceTokenizer(
+        _load(lambda library: library.AutoTokenizer, Path(model)) if isinstance(model, str | Path) else model
+    )
 
 
-def _load(kind: str, path: Path, **settings: Any) -> Any:
+def _load(kind: Callable[[Any], Any], path: Path, **settings: Any) -> Any:
     try:
         import transformers
     except ImportError:
@@ -48,7 +54,7 @@ def _load(kind: str, path: Path, **settings: Any) -> Any:
         raise UserError(f"{path}: no such folder or .gguf file (models are read from the disk, never downloaded)")
     folder, file = (path.parent, {"gguf_file": path.name}) if path.suffix == ".gguf" else (path, {})
     try:
-        return getattr(transformers, kind).from_pretrained(folder, local_files_only=True, **file, **settings)
+        return kind(transformers).from_pretrained(folder, local_files_only=True, **file, **settings)
     except (OSError, ValueError, ImportError) as error:
         raise UserError(f"{path} holds no model that transformers reads: {str(error).splitlines()[0]}") from error
 

@@ -82,7 +82,7 @@ class TokenActor(TensorDictModuleBase):
     def __init__(self, network: nn.Module, vocabulary: Vocabulary, *, temperature: float = 1.0) -> None:
         super().__init__()
         self.network, self.stop, self.pad = network, vocabulary.stop, vocabulary.pad
-        self.register_buffer("temperature", torch.tensor(float(temperature)))
+        self.register_buffer("temperature", torch.tensor(float(temperature), dtype=torch.float64))
         self.in_keys, self.out_keys = [TOKENS, ATTENTION, COMPLETION], [LOG_PROBS]
 
     def get_dist(self, tensordict: TensorDictBase, logits_key: str | None = None) -> TokenDistribution:

@@ -9,7 +9,7 @@ from pgkit.errors import UserError
 from pgkit.modules.tokens import TokenDistribution, draw
 
 
-def model(seed=0, scale=3.0, **settings):
+def model(seed=0, scale=1.5, **settings):
     """A model whose logits are not all alike, and an environment."""
     torch.manual_seed(seed)
     env = envs.prompts("addition", 6, seed=seed)
