@@ -100,7 +100,7 @@ def _make_dm_control(env_id: str, **kwargs: Any) -> gym.Env:
 def _unknown(env_id: str, known: list[str]) -> UserError:
     nearest = difflib.get_close_matches(env_id, known, n=3, cutoff=0.4)
     hint = f"; the nearest names are {', '.join(nearest)}" if nearest else "; see gymnasium.pprint_registry()"
-    return UserError(f"unknown environment id '{env_id}'{hint}")
+    return UserError(f"unknown environment id '{env_id}'{hint}; where a package registers it: PACKAGE:{env_id}")
 
 
 def _extra(env_id: str) -> str:

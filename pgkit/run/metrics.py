@@ -115,6 +115,7 @@ class Metrics:
 
     def _to_board(self, name: str, value: Any, frames: int) -> None:
         try:
+            self.path.parent.stat()  # a directory that is gone would end the writer's thread with a traceback
             self._board.add_scalar(name, value, frames)
         except OSError as error:
             self._board = None

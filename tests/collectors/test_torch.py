@@ -135,7 +135,7 @@ def test_a_resume_is_exact_or_begins_new_episodes_and_says_which(make, exact, ca
 @pytest.mark.parametrize("make", [transformed, Inexact])
 def test_a_run_trains_evaluates_and_resumes(make, tmp_path, capsys, caplog):
     def train(**flags: Any) -> None:
-        args = run.RunArgs(env_id="pendulum", run_dir=tmp_path / "r", eval_episodes=4, **flags)
+        args = PendulumArgs(env_id="pendulum", run_dir=tmp_path / "r", eval_episodes=4, **flags)
         with run.Run(args, "torch") as log:
             actor, update, collector = agent(time_limited if make is Inexact else make, 4, 25)
             collector.total_frames = args.total_frames
@@ -151,13 +151,23 @@ def test_a_run_trains_evaluates_and_resumes(make, tmp_path, capsys, caplog):
         train(total_frames=400, resume=tmp_path / "r")
     assert ("goes on where it was" if make is transformed else "begins anew") in caplog.text
     assert "eval/mean_reward" in (tmp_path / "r" / "metrics.csv").read_text()
-    policy = run.load_policy(tmp_path / "r", "latest")
+    policy = run.load_policy(tmp_path / "r", "latest", agent=pendulum_agent)
     assert policy.frames == 400 and policy.predict(np.zeros(3)).shape == (1,)
     assert abs(policy.predict(np.full(3, 1e6))) <= 2
 
 
-def evaluation(num_envs: int, seed: int) -> envs.VectorEnv:
+def evaluation(num_envs: int, seed: int, workers: int = 1) -> envs.VectorEnv:
     return envs.make(transformed, num_envs, seed=seed)
+
+
+class PendulumArgs(run.RunArgs):
+    """Settings of a run on an environment that has no id."""
+
+    make_env = staticmethod(evaluation)
+
+
+def pendulum_agent(args: PendulumArgs, env: envs.VectorEnv) -> run.Agent:
+    return run.Agent(agent(transformed, 4, 25)[0])
 
 
 class Team(EnvBase):
