@@ -93,7 +93,7 @@ class TD3Loss(QLoss):
         low, high = bounds or (x[(0,) * (x.dim() - 1)] for x in (space.low, space.high))  # of a vector: the first's
         numbers = {"min_action": low, "max_action": high, "policy_noise": policy_noise, "noise_clip": noise_clip}
         for name, number in numbers.items():
-            self.register_buffer(name, torch.as_tensor(number))
+            self.register_buffer(name, torch.as_tensor(number, device=next(self.parameters()).device))
         self.set_distance(loss_function)
 
     def _writes(self) -> list[NestedKey]:
