@@ -33,8 +33,8 @@ def read_csv(path: Path) -> tuple[list[str], list[dict[str, str]]]:
             reader = csv.DictReader(file, strict=True)
             columns = list(reader.fieldnames or [])
             rows = [row for row in reader if None not in row and None not in row.values()]
-        for row in rows:
-            int(row["frames"]), [float(value) for value in row.values() if value]
+        for name in columns:
+            column(rows, name)  # numbers, all of them
     except (OSError, ValueError, KeyError, csv.Error) as error:
         raise UserError(f"{path} is damaged: {error}") from error
     return columns, rows
