@@ -295,6 +295,7 @@ def test_an_error_in_pgkit_or_below_shows_every_frame(tmp_path: Path):
 def test_a_reader_that_goes_away_is_no_error(trained: Path):
     code = "from pgkit.cli.main import main; main(['ls'])"
     with subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as ls:
+        assert ls.stdout and ls.stderr
         ls.stdout.close()
         assert ls.stderr.read() == b""
     assert ls.returncode == 141

@@ -49,6 +49,15 @@ def test_tensorboard_gets_the_same_scalars(tmp_path: Path):
     assert [(event.step, event.value) for event in events.Scalars("train/x")] == [(10, 0.5), (20, 0.25)]
 
 
+def test_tensorboard_forgets_what_a_resume_drops(tmp_path: Path):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    write(tmp_path, {"frames": 10, "x": 1.0}, {"frames": 20, "x": 2.0}, {"frames": 30, "x": 3.0})
+    write(tmp_path, {"frames": 40, "x": 4.0}, upto=20)
+    events = EventAccumulator(str(tmp_path)).Reload()
+    assert [(event.step, event.value) for event in events.Scalars("x")] == [(10, 1.0), (20, 2.0), (40, 4.0)]
+
+
 def test_finished_episodes_are_those_where_done_oldest_first():
     done = torch.tensor([[0, 0, 1], [1, 0, 0]], dtype=torch.bool)  # env 1 ends at t = 0, env 0 at t = 2
     reward = torch.tensor([[1.0, 2.0, 3.0], [10.0, 1.0, 2.0]])
