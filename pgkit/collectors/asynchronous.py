@@ -13,7 +13,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from pgkit.collectors.policy import Beside, example
+from pgkit.collectors.actor import Beside, example
 from pgkit.collectors.stepping import as_rollout
 from pgkit.collectors.vector import count, say_resume
 from pgkit.collectors.workers import Workers, check_splits, shares

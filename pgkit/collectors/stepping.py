@@ -11,7 +11,8 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from pgkit.collectors.policy import STATE, RowPolicy, choices, function_of, memory, padded_rows, random_actions
+from pgkit.collectors.actor import STATE, memory
+from pgkit.collectors.policy import RowPolicy, choices, function_of, padded_rows, random_actions
 from pgkit.compiled import Mode
 from pgkit.envs import VectorEnv
 from pgkit.errors import UserError

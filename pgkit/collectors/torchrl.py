@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.data import Unbounded
 from torchrl.envs import Compose, EnvBase, InitTracker, RewardSum, StepCounter, TensorDictPrimer, TransformedEnv
 
-from pgkit.collectors.policy import check_types, memory
+from pgkit.collectors.actor import check_types, memory
 from pgkit.errors import UserError
 
 

@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
-from pgkit.collectors.policy import Beside, example
+from pgkit.collectors.actor import Beside, example
 from pgkit.collectors.stepping import MASK, Share, allocate, as_rollout, regroup
 from pgkit.collectors.workers import Workers, check_splits
 from pgkit.compiled import Constants, choose

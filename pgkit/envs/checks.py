@@ -10,8 +10,9 @@ from gymnasium import spaces
 
 from pgkit.errors import UserError
 
-_FLAGS = {bool, np.bool_}
-_NUMBERS = {float, int, np.float64, np.float32, np.int64}
+# the usual types of flags and rewards, which need no look
+FLAGS = {bool, np.bool_}
+NUMBERS = {float, int, np.float64, np.float32, np.int64}
 
 
 def checked_reset(env: gym.Env, seed: int) -> tuple[Any, dict[str, Any]]:
@@ -29,11 +30,6 @@ def checked_reset(env: gym.Env, seed: int) -> tuple[Any, dict[str, Any]]:
         raise UserError(f"{_name(env)}.reset returned {_kind(result)}: return the tuple (observation, info)")
     _check_observation(env, "reset", result[0])
     return result
-
-
-def plain(result: Any) -> bool:
-    """Whether a step's reward and flags are of the usual types, so that :func:`check_step` need not look."""
-    return len(result) == 5 and type(result[1]) in _NUMBERS and type(result[2]) in _FLAGS and type(result[3]) in _FLAGS
 
 
 def check_step(env: gym.Env, action: np.ndarray, result: Any) -> None:

@@ -12,7 +12,7 @@ from gymnasium.vector.utils import iterate
 from torch import Tensor
 from torchrl.data import Categorical, Composite, TensorSpec, Unbounded
 
-from pgkit.envs.spaces import Entry
+from pgkit.envs.spaces import Entry, itself
 from pgkit.seams import Entries, Key
 
 Info: TypeAlias = Sequence[Key] | Mapping[Key, TensorSpec]
@@ -25,12 +25,12 @@ class Observations:
         self.entries = entries
         self.arrays = [np.zeros((num_envs, *entry.shape), entry.dtype) for entry in entries]
         self.tensors: Entries = {entry.key: torch.from_numpy(x) for entry, x in zip(entries, self.arrays, strict=True)}
-        self._rows = [(entry.read, x, entry.shape) for entry, x in zip(entries, self.arrays, strict=True)]
+        self._columns = [(entry.read, x, entry.shape) for entry, x in zip(entries, self.arrays, strict=True)]
 
     def write(self, row: int, obs: Any) -> None:
         """Writes what one environment returned; ``ValueError`` where it is not of its space's shape."""
-        for read, array, shape in self._rows:
-            x = read(obs)
+        for read, array, shape in self._columns:
+            x = obs if read is itself else read(obs)
             if (x.shape if type(x) is np.ndarray else np.shape(x)) != shape:
                 raise ValueError(f"shape {np.shape(x)}, its space says {shape}")
             array[row] = x

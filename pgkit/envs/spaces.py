@@ -66,7 +66,7 @@ def observation_entries(space: gym.Space, flatten: bool = True) -> list[Entry]:
         return _apart(space)
     if isinstance(space, spaces.Box):
         image = space.dtype == np.uint8 and len(space.shape) > 1
-        return [_box("observation", space, np.uint8 if image else np.float32, _itself)]
+        return [_box("observation", space, np.uint8 if image else np.float32, itself)]
     if not _flattens(space):
         raise UserError(f"the observation space {space} cannot become one vector: encode it in a wrapper")
     parts = space.spaces if isinstance(space, spaces.Dict) else {}
@@ -120,7 +120,7 @@ def _box(name: str, space: spaces.Box, dtype: Any, get: Callable[[Any], Any]) ->
     return Entry(name, (1,), dtype, partial(_lifted, get), None)
 
 
-def _itself(obs: Any) -> Any:
+def itself(obs: Any) -> Any:
     return obs
 
 
