@@ -131,6 +131,9 @@ def _text(value: float) -> str:
     return "" if math.isnan(value) else str(value)
 
 
+_NO_INFO = {"reward", "done", "terminated", "truncated", "episode_reward", "step_count", "is_init"}
+
+
 def finished_episodes(rollout: TensorDictBase | None) -> list[tuple[float, int]]:
     """``(return, length)`` of the episodes that end in a rollout ``[num_envs, T]``, oldest first.
 
@@ -141,6 +144,24 @@ def finished_episodes(rollout: TensorDictBase | None) -> list[tuple[float, int]]
     done = done.squeeze(-1).T
     rewards, lengths = (rollout["next", name].squeeze(-1).T[done] for name in ("episode_reward", "step_count"))
     return list(zip(rewards.tolist(), lengths.tolist(), strict=True))
+
+
+def finished_infos(rollout: TensorDictBase | None) -> dict[str, float]:
+    """Means over the episodes that end in a rollout of the single numbers that only ``next`` has: declared ``info``.
+
+    ``is_success`` is logged as ``rollout/success_rate``, any other under its own name.
+    """
+    if rollout is None or not (done := rollout["next", "done"]).any():
+        return {}
+    found = {}
+    for key in rollout["next"].keys(True, True):
+        path = (key,) if isinstance(key, str) else key
+        if path[-1] in _NO_INFO or key in rollout.keys(True, True) or rollout[("next", *path)].shape != done.shape:
+            continue
+        ends = rollout[("next", *path)][done].double()
+        if (ends := ends[~ends.isnan()]).numel():
+            found["rollout/" + ("success_rate" if path == ("is_success",) else "_".join(path))] = float(ends.mean())
+    return found
 
 
 def averages(rows: Sequence[Mapping[str, float]]) -> dict[str, float]:
