@@ -5,7 +5,7 @@ A block is anything that meets its seam; nothing has to be subclassed. ``docs/pa
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, Literal, NamedTuple, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
@@ -141,9 +141,15 @@ class KeepsDistribution(Protocol):
 
 @runtime_checkable
 class Memory(Protocol):
-    """A module whose state goes from step to step, ``state_size`` numbers: a recurrent core, correlated noise."""
+    """A module whose state goes from step to step: a recurrent core, correlated noise.
 
-    state_size: int
+    Attributes:
+        state_key: entry of the state before a step; the one after it lies below ``next``.
+        state_shape: shape of one environment's state.
+    """
+
+    state_key: Any
+    state_shape: Sequence[int]
 
 
 @runtime_checkable

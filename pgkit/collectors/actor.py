@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -14,9 +15,26 @@ from torchrl.modules import OrnsteinUhlenbeckProcessModule
 
 from pgkit.envs import VectorEnv
 from pgkit.errors import UserError
-from pgkit.seams import Entries, Key
+from pgkit.seams import Entries, Key, Memory
 
-STATE: Key = ("next", "recurrent_state")
+
+def state_of(actor: torch.nn.Module) -> tuple[Key, Sequence[int]] | None:
+    """Key and shape of the state that an actor carries from step to step; None for an actor without memory."""
+    found = next((part for part in actor.modules() if isinstance(part, Memory)), None)
+    if found is None:
+        return None
+    key = found.state_key
+    return (key[0] if len(path_of(key)) == 1 and not isinstance(key, str) else key), found.state_shape
+
+
+def path_of(key: Key) -> tuple[str, ...]:
+    """A nested key as a tuple."""
+    return (key,) if isinstance(key, str) else key
+
+
+def is_state(output: Key) -> bool:
+    """Whether an actor's output is its state after a step."""
+    return path_of(output)[0] == "next"
 
 
 def output_keys(actor: TensorDictModuleBase) -> list[Any]:
@@ -30,14 +48,16 @@ def output_keys(actor: TensorDictModuleBase) -> list[Any]:
     if not samples:
         return list(actor.out_keys)
     log_probs: Any = actor.log_prob_keys
-    return [*samples, *[key for key in (*log_probs, STATE) if key in actor.out_keys]]
+    return [*samples, *[key for key in actor.out_keys if key in log_probs or is_state(key)]]
 
 
 def memory(actor: TensorDictModuleBase, num_envs: int, device: torch.device | None = None) -> dict[Key, Tensor]:
     """What a recurrent actor reads besides the observation, at the start of an episode; nothing for any other."""
-    size = next((int(m.state_size) for m in actor.modules() if hasattr(m, "state_size")), 0)
+    if (state := state_of(actor)) is None:
+        return {}
+    key, shape = state
     is_init = torch.ones(num_envs, 1, dtype=torch.bool, device=device)
-    return {"is_init": is_init, "recurrent_state": torch.zeros(num_envs, size, device=device)} if size else {}
+    return {"is_init": is_init, key: torch.zeros(num_envs, *shape, device=device)}
 
 
 def example(env: VectorEnv, actor: TensorDictModuleBase) -> Entries:

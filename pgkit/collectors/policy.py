@@ -15,7 +15,7 @@ from torch.overrides import TorchFunctionMode
 from torchrl.data import Composite, MultiCategorical, TensorSpec
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from pgkit.collectors.actor import STATE, output_keys
+from pgkit.collectors.actor import is_state, output_keys
 from pgkit.collectors.noise import Streams, census, fed
 from pgkit.compiled import Compiled, Mode, compiled, undone
 from pgkit.envs.seeding import episode_seed
@@ -51,7 +51,7 @@ def random_actions(spec: Composite, keys: Sequence[Key], outputs: Entries) -> Ac
         made = []
         for key, x in outputs.items():
             if key not in spec.keys(True, True):
-                made.append(torch.full_like(x[:rows], 0.0 if key == STATE else torch.nan))
+                made.append(torch.full_like(x[:rows], 0.0 if is_state(key) else torch.nan))
             elif masks[key] in given:
                 made.append(_allowed(spec[key], given[masks[key]].bool()))
             else:

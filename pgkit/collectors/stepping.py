@@ -11,7 +11,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from pgkit.collectors.actor import STATE, memory
+from pgkit.collectors.actor import is_state, memory, path_of
 from pgkit.collectors.policy import RowPolicy, choices, function_of, padded_rows, random_actions
 from pgkit.compiled import Mode
 from pgkit.envs import VectorEnv
@@ -24,9 +24,9 @@ MASK: Key = ("collector", "mask")
 def allocate(steps: int, env: VectorEnv, outputs: Entries) -> Entries:
     """Buffers ``[steps, N, ...]`` for a rollout, from the specs and from examples ``[N, ...]`` of the outputs."""
     made: dict[Any, Any] = {**dict(_specs(env.observation_spec)), **outputs}
-    if STATE in outputs:
-        flag = torch.zeros(env.num_envs, 1, dtype=torch.bool, device=env.device)
-        made |= {"recurrent_state": outputs[STATE], "is_init": flag, ("next", "is_init"): flag}
+    for key in filter(is_state, outputs):
+        flag, path = torch.zeros(env.num_envs, 1, dtype=torch.bool, device=env.device), path_of(key)[1:]
+        made |= {path if len(path) > 1 else path[0]: outputs[key], "is_init": flag, ("next", "is_init"): flag}
     made |= {("next", *_path(key)): x for key, x in [*_specs(env.observation_spec), *_specs(env.info_spec)]}
     for key, spec in _specs(env.full_reward_spec):
         made |= {("next", *_path(key)): spec, ("next", *_total(key)): spec}
@@ -102,7 +102,8 @@ class Share:
             self._fresh = simulator.reset()
         fresh, remembered, observed = self._fresh, self._memory, self._observed
         actions = [(key, self._outputs.index(key)) for key in self._actions]
-        state = self._outputs.index(STATE) if remembered else None
+        states = [at for at, key in enumerate(self._outputs) if is_state(key)]
+        kept = [key for key in remembered if key != "is_init"]
         with policy.steps(step, self._steps) as noise:
             for now, decided, after, drawn, t in zip(
                 self._now, self._decided, self._next, noise, range(self._steps), strict=True
@@ -118,7 +119,8 @@ class Share:
                 ])  # fmt: skip
                 fresh = made.fresh
                 if remembered:
-                    remembered = {"is_init": made.begun().unsqueeze(-1), "recurrent_state": outputs[state]}
+                    remembered = {"is_init": made.begun().unsqueeze(-1)}
+                    remembered |= {key: outputs[at] for key, at in zip(kept, states, strict=True)}
                 if self._mask is not None and made.mask is not None:
                     self._mask[t].copy_(made.mask)
         self._fresh, self._memory = fresh, remembered

@@ -45,8 +45,8 @@ class TorchRLCollector:
         if state := memory(actor, env.batch_size.numel()):
             if not env.batch_size:
                 raise UserError("a recurrent actor reads a batch of environments, this is one: SerialEnv(1, make_env)")
-            size = state["recurrent_state"].shape[-1]
-            transforms += [InitTracker(), TensorDictPrimer(recurrent_state=Unbounded((size,)), expand_specs=True)]
+            primers = {key: Unbounded(x.shape[1:]) for key, x in state.items() if key != "is_init"}
+            transforms += [InitTracker(), TensorDictPrimer(primers, expand_specs=True)]
         env = TransformedEnv(env, Compose(*transforms))
         self.frames, self.total_frames, self.compile_seconds = 0, total_frames, 0.0
         kwargs = {"trust_policy": True, "auto_register_policy_transforms": True} | kwargs

@@ -139,7 +139,7 @@ def as_resumed(args: RunArgs, run_dir: Path) -> None:
     """Gives ``args`` the settings of the run that goes on, as the command line does; a warning names other values."""
     saved, free = saved_args(type(args), run_dir), {*free_on_resume(type(args)), "run_dir"}
     check_imports(saved, args.trust, *args.imports())
-    kept = {name: value for name, value in vars(saved).items() if name not in free and getattr(args, name) != value}
+    kept = {name: value for name, value in vars(saved).items() if name not in free and vars(args)[name] != value}
     if kept:
         names = ", ".join(f"{name}={value!r}" for name, value in sorted(kept.items()))
         logging.getLogger("pgkit").warning("the resumed run keeps its own settings: %s", names)

@@ -11,6 +11,7 @@ from tensordict import TensorDict
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from pgkit.collectors.actor import path_of, state_of
 from pgkit.envs import vector_of
 from pgkit.errors import check_whole_number
 from pgkit.run.seeding import preserved_rng
@@ -43,21 +44,22 @@ class Acting:
 
     def __init__(self, policy: torch.nn.Module, keys: tuple[Key, ...] = ("action",)) -> None:
         self.policy, self.keys = policy, keys
-        self.size = next((int(part.state_size) for part in policy.modules() if hasattr(part, "state_size")), 0)
+        self.memory = state_of(policy)
         self.device = next((x.device for x in (*policy.parameters(), *policy.buffers())), None)
         self.state: Tensor | None = None
 
     def __call__(self, entries: Mapping[Key, Tensor], begun: Tensor, deterministic: bool = True) -> Entries:
         """Actions ``[N, ...]`` by key for the entries ``[N, ...]`` that it reads; ``begun [N]``: an episode begins."""
         batch = TensorDict(dict(entries), [len(begun)]).to(self.device)
-        if self.size:
+        if self.memory is not None:
+            key, shape = self.memory
             batch["is_init"] = begun.unsqueeze(-1).to(self.device)
-            start = torch.zeros(len(begun), self.size, device=self.device)
-            batch["recurrent_state"] = start if self.state is None else self.state
+            start = torch.zeros(len(begun), *shape, device=self.device)
+            batch[key] = start if self.state is None else self.state
         kind = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
         with torch.no_grad(), set_exploration_type(kind):
             out = self.policy(batch)
-        self.state = out.get(("next", "recurrent_state"), None)
+        self.state = None if self.memory is None else out[("next", *path_of(self.memory[0]))]
         return {key: out[key] for key in self.keys}
 
 
