@@ -5,9 +5,10 @@ A block is anything that meets its seam; nothing has to be subclassed. ``docs/pa
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, Literal, NamedTuple, Protocol, TypeAlias, runtime_checkable
 
+import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -19,14 +20,15 @@ Entries: TypeAlias = dict[Key, Tensor]
 
 
 class Step(NamedTuple):
-    """What a simulator's step gives; flags and rewards are ``[N, 1]``, with agents ``[N, A, 1]``.
+    """What a simulator's step gives. Its tensors may be overwritten by the next step: copy what is to stay.
 
     Attributes:
         next: the true next observations, never those after a reset.
-        reward: by the keys of ``reward_spec``.
-        terminated, truncated: by the keys of ``done_spec``.
-        info: the declared entries that are no observation.
+        reward: by the keys of ``reward_spec``, ``[N, 1]``, with agents ``[N, A, 1]``.
+        terminated, truncated: by the keys of ``done_spec`` that end in these names, shaped as ``done``.
+        info: the entries of ``info_spec``.
         fresh: what the policy reads next: as ``next``, where an episode ended the first observation of the new one.
+        mask: bool ``[N]``, where the action counted; None: everywhere. Where it did not, an episode began instead.
     """
 
     next: Entries
@@ -35,6 +37,18 @@ class Step(NamedTuple):
     truncated: Entries
     info: Entries
     fresh: Entries
+    mask: Tensor | None = None
+
+    def ended(self) -> Tensor:
+        """Bool ``[N]``: where an episode ended; with agents, the flag at the root, else all agents together."""
+        if "terminated" in self.terminated:
+            return (self.terminated["terminated"] | self.truncated["truncated"]).flatten()
+        pairs = zip(self.terminated.values(), self.truncated.values(), strict=True)
+        return torch.stack([(a | b).flatten(1).all(1) for a, b in pairs]).all(0)
+
+    def begun(self) -> Tensor:
+        """Bool ``[N]``: where ``fresh`` is the first observation of an episode."""
+        return self.ended() if self.mask is None else ~self.mask
 
 
 @runtime_checkable
@@ -44,9 +58,13 @@ class Simulator(Protocol):
     Attributes:
         num_envs: number of environments, ``N``.
         device: where its tensors live.
-        observation_spec, action_spec, reward_spec, done_spec: TorchRL's, of batch size ``[N]``.
+        observation_spec, action_spec, reward_spec, done_spec: TorchRL's, of batch size ``[N]``; entries of a group of
+            agents lie under its name.
+        info_spec: further entries that a step gives.
         resume: what :meth:`state_dict` promises: every environment ``exact`` as it was, or ``new episodes``.
-        episode_reward: return so far of the episodes that the last step belonged to, before any reset; keyed as reward.
+        masks: whether :attr:`Step.mask` is given.
+        episode_reward: return so far of the episodes that the last step belonged to, before any reset; by the rewards'
+            keys.
         step_count: their length so far, int64 ``[N]``.
     """
 
@@ -56,21 +74,34 @@ class Simulator(Protocol):
     action_spec: Composite
     reward_spec: Composite
     done_spec: Composite
+    info_spec: Composite
     resume: Literal["exact", "new episodes"]
+    masks: bool
     episode_reward: Entries
     step_count: Tensor
 
-    def reset(self, seed: int | None = None) -> Entries:
-        """Begins an episode everywhere; the first observations."""
+    def reset(self, seed: int | None = None, rows: Tensor | None = None) -> Entries:
+        """Begins an episode everywhere, or where ``rows [N]`` is set, unless one has just begun; what the policy reads.
+
+        With ``seed``, everything is as in a new simulator with that seed.
+        """
         ...
 
     def step(self, action: Entries) -> Step:
         """Steps every environment; those whose episode ends begin the next one."""
         ...
 
-    def state_dict(self) -> dict[str, Any]: ...
+    def to_env(self, actions: np.ndarray, /) -> np.ndarray:
+        """A policy's actions ``[B, ...]`` as one environment takes them: within bounds, of its type."""
+        ...
 
-    def load_state_dict(self, state: dict[str, Any]) -> None: ...
+    def state_dict(self) -> dict[str, Any]:
+        """Where environments have a state each, they are the items of its list ``rows``."""
+        ...
+
+    def load_state_dict(self, state: dict[str, Any]) -> Entries:
+        """Goes on from :meth:`state_dict` as :attr:`resume` says; what the policy reads next."""
+        ...
 
     def close(self) -> None: ...
 
@@ -110,9 +141,15 @@ class KeepsDistribution(Protocol):
 
 @runtime_checkable
 class Memory(Protocol):
-    """A module whose state goes from step to step, ``state_size`` numbers: a recurrent core, correlated noise."""
+    """A module whose state goes from step to step: a recurrent core, correlated noise.
 
-    state_size: int
+    Attributes:
+        state_key: entry of the state before a step; the one after it lies below ``next``.
+        state_shape: shape of one environment's state.
+    """
+
+    state_key: Any
+    state_shape: Sequence[int]
 
 
 @runtime_checkable

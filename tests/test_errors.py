@@ -9,8 +9,7 @@ import torch
 from torch import nn
 
 from pgkit import advantages, collectors, controllers, data, envs, losses, modules, updates
-from pgkit.envs.layout import layout
-from pgkit.envs.vector import action_spec
+from pgkit.envs.spaces import action_spec, observation_entries
 from pgkit.errors import UserError, check_whole_number, within
 
 ENV = envs.make("Pendulum-v1")
@@ -60,7 +59,7 @@ STORED = ENV.rollout(4).exclude("action_log_prob")
         (lambda: action_spec(gym.spaces.MultiBinary([2, 3]), 1), r"has shape \(2, 3\), actions are vectors: flatten"),
         (lambda: action_spec(gym.spaces.MultiDiscrete([[2, 3], [4, 5]]), 1), r"has shape \(2, 2\), actions are"),
         (
-            lambda: layout(gym.spaces.Dict(step_count=gym.spaces.Discrete(2))),
+            lambda: observation_entries(gym.spaces.Dict(step_count=gym.spaces.Discrete(2)), flatten=False),
             "'step_count' has a name that rollouts us",
         ),
         (lambda: SAC(temperature=WithANumber()), "WithANumber.alpha is 0.2: make it a tensor of one number"),

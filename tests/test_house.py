@@ -25,7 +25,7 @@ MAY_IMPORT = {
     "collectors": {"envs", "compiled", "torchrl"},
 }
 EVERYTHING = {"torchrl", "gymnasium", *MAY_IMPORT}
-MAY_IMPORT |= {"run": EVERYTHING, "cli": EVERYTHING | {"run"}}
+MAY_IMPORT |= {"run": EVERYTHING | {"cli"}, "cli": EVERYTHING | {"run"}}
 BASES = ("base", "actors", "policy_base", "q_base", "soft_base")  # plumbing, and the forward that a family shares
 
 

@@ -25,9 +25,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Run one command: exit 2 and one line on a user's error, 3 on divergence, 130 on Ctrl-C."""
     with exits():
         args, flags = parser().parse_known_args(argv)
-        if flags and not getattr(args, "takes_flags", False):
+        if flags and not args.takes_flags:
             raise UserError(f"unrecognized arguments: {' '.join(flags)} (see pgkit --help)")
-        args.flags = flags or getattr(args, "flags", [])
+        args.flags = flags or args.flags
         args.command(args)
 
 
@@ -35,6 +35,7 @@ def parser() -> Parser:
     """The command line's grammar."""
     top = Parser(prog="pgkit", description="Policy-gradient building blocks on TorchRL.", allow_abbrev=False)
     top.add_argument("--version", action="version", version=f"pgkit {version()}")
+    top.set_defaults(takes_flags=False, flags=[])
     commands = top.add_subparsers(required=True, metavar="COMMAND")
 
     command = commands.add_parser("ls", help="list the recipes")

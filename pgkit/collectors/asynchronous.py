@@ -11,14 +11,16 @@ from typing import Any
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
+from torchrl.envs import EnvBase
 
-from pgkit.collectors.policy import check_env, example, output_keys
-from pgkit.collectors.stepping import Arrays, as_rollout
-from pgkit.collectors.workers import Workers, shares
+from pgkit.collectors.actor import Beside, example
+from pgkit.collectors.stepping import as_rollout
+from pgkit.collectors.vector import count, say_resume
+from pgkit.collectors.workers import Workers, check_splits, shares
 from pgkit.compiled import choose
-from pgkit.envs import VectorEnv
-from pgkit.envs.arrays import episode_seed
+from pgkit.envs import vector_of
 from pgkit.errors import UserError
+from pgkit.seams import Entries
 
 
 class AsyncCollector:
@@ -33,7 +35,7 @@ class AsyncCollector:
     https://arxiv.org/abs/1802.01561).
 
     Args:
-        env: from :func:`pgkit.envs.make`.
+        env: from :func:`pgkit.envs.make`, of what can be made in another process.
         actor: as for :class:`~pgkit.collectors.VectorCollector`.
         frames_per_batch: frames of a rollout that is handed out.
         total_frames: frames after which iteration stops; -1: never.
@@ -45,13 +47,13 @@ class AsyncCollector:
         compile: ``on``, ``off`` or ``auto``, for the policy.
 
     Raises:
-        UserError: sizes that do not fit, an environment of TorchRL's own (transforms included), or an actor that was
-            built for another environment.
+        UserError: sizes that do not fit, environments that this process holds, or an actor that was built for another
+            environment.
     """
 
     def __init__(
         self,
-        env: VectorEnv,
+        env: EnvBase,
         actor: TensorDictModuleBase,
         *,
         frames_per_batch: int,
@@ -62,7 +64,8 @@ class AsyncCollector:
         delay: int = 0,
         compile: str = "auto",
     ) -> None:
-        check_env(env, self)
+        env = vector_of(env)
+        check_splits(env)
         cuts = shares(env)
         self._bounds = [cuts[i : i + 2] for i in range(env.workers)] if per_worker else [cuts]
         columns = {bounds[-1] - bounds[0] for bounds in self._bounds}
@@ -82,12 +85,12 @@ class AsyncCollector:
         self._steps = frames_per_batch // min(columns)
         calls = None if total_frames < 0 else total_frames / env.num_envs
         self._compile = choose(compile, calls, least_calls=50_000)
-        self._outputs = dict(zip(output_keys(actor), example(env, actor), strict=True))
+        self._outputs, self._beside = example(env, actor), Beside(actor, env)
         self._groups: list[Workers] = []
         self._updates = 0  # rollouts handed out: the caller makes one update with each
         self._orders = [0] * len(self._bounds)  # rollouts ordered, by group
         self._versions = [0] * len(self._bounds)  # the update whose weights a group collects with
-        self._done: list[Arrays | None] = [None] * len(self._bounds)  # collected, not handed out (after a checkpoint)
+        self._done: list[Entries | None] = [None] * len(self._bounds)  # collected, not handed out (after a checkpoint)
         self._past: deque[tuple[int, list[Tensor]]] = deque(maxlen=delay + 1)  # weights, the oldest first
 
     def __iter__(self) -> Iterator[TensorDictBase]:
@@ -101,13 +104,14 @@ class AsyncCollector:
             for group in range(len(self._groups)):
                 self._order(group)
         group = self._next()
-        arrays = self._done[group] or self._groups[group].finish()
+        buffers = self._done[group] or self._groups[group].finish()
         self._done[group] = None
         self.lag = self._updates - self._versions[group]
-        self.frames += self.frames_per_batch
+        rollout = as_rollout(buffers, self.env)
+        self.frames += count(rollout)
         self._order(group)
         self._updates += 1
-        return as_rollout(arrays, self.env)
+        return self._beside.bring(rollout)
 
     def state_dict(self) -> dict[str, Any]:
         """Counters, rollouts that are collected but not handed out yet, and every environment's state."""
@@ -126,6 +130,7 @@ class AsyncCollector:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restores :meth:`state_dict`, taken with the same workers."""
         self.frames, self._updates = state["frames"], state["updates"]
+        say_resume(self.env)
         if not state["envs"]:
             return
         if len(state["envs"]) != len(self._bounds):
@@ -145,11 +150,11 @@ class AsyncCollector:
         for workers in self._groups:
             workers.close()
         self._groups = []
-        self.env.close_arrays()
+        self.env.close_simulator()
 
     def _start(self) -> None:
         start = time.perf_counter()
-        settings = self.env, self.actor, self._steps, self._outputs, self._compile
+        settings = self.env, self._beside.actor, self._steps, self._outputs, self._compile
         self._groups = [Workers(*settings, bounds) for bounds in self._bounds]
         self.compile_seconds += time.perf_counter() - start
 
@@ -162,9 +167,9 @@ class AsyncCollector:
             version, weights = self._past[0]
         self._versions[group] = version
         random = sum(self._orders) * self.frames_per_batch < self.init_random_frames
-        seed = episode_seed(self.env.seed, -1 % 2**32, self._orders[group])
+        step = self._orders[group] * self._steps
         self._orders[group] += 1
-        self._groups[group].begin(weights, seed, random)
+        self._groups[group].begin(weights, step, random)
 
     def _next(self) -> int:
         """The group to hand out: the oldest weights of those that are ready, or of all if one would get too old."""

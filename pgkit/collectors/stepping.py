@@ -1,123 +1,236 @@
-"""The inner loop of collecting: policy, environments, arrays; no TensorDict."""
+"""The inner loop of collecting: policy, simulator, buffers; no TensorDict."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from itertools import pairwise
 from typing import Any
 
-import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.utils import NestedKey
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from pgkit.collectors.policy import STATE, Act, choices
-from pgkit.envs import ArrayEnv, VectorEnv
+from pgkit.collectors.actor import is_state, memory, path_of
+from pgkit.collectors.policy import RowPolicy, choices, function_of, padded_rows, random_actions
+from pgkit.compiled import Mode
+from pgkit.envs import VectorEnv
 from pgkit.errors import UserError
+from pgkit.seams import Entries, Key, Simulator
 
-Arrays = dict[NestedKey, np.ndarray]
-
-
-def allocate(steps: int, obs: np.ndarray, outputs: dict[NestedKey, Tensor]) -> Arrays:
-    """Empty arrays ``[steps, N, ...]`` for a rollout; ``outputs`` are examples ``[N, ...]`` of the policy's results."""
-    num_envs = len(obs)
-    recurrent: Arrays = {}
-    if STATE in outputs:
-        recurrent["recurrent_state"] = np.empty((steps, *outputs[STATE].shape), np.float32)
-        recurrent["is_init"] = np.empty((steps, num_envs, 1), bool)
-        recurrent["next", "is_init"] = np.zeros((steps, num_envs, 1), bool)
-    flag = {("next", key): np.empty((steps, num_envs, 1), bool) for key in ("terminated", "truncated")}
-    return {
-        "observation": np.empty((steps, *obs.shape), np.float32),
-        **{key: np.empty((steps, *x.shape), x.numpy().dtype) for key, x in outputs.items()},
-        **recurrent,
-        ("next", "observation"): np.empty((steps, *obs.shape), np.float32),
-        ("next", "reward"): np.empty((steps, num_envs, 1), np.float32),
-        **flag,
-        ("next", "episode_reward"): np.empty((steps, num_envs, 1), np.float32),
-        ("next", "step_count"): np.empty((steps, num_envs, 1), np.int64),
-    }
+MASK: Key = ("collector", "mask")
 
 
-@torch.inference_mode()
-def fill(arrays: Arrays, envs: ArrayEnv, act: Act, keys: Sequence[NestedKey], num_envs: int, seed: int) -> None:
-    """Steps ``envs`` through ``arrays`` with the policy ``act``, writing the columns of these environments.
+def allocate(steps: int, env: VectorEnv, outputs: Entries) -> Entries:
+    """Buffers ``[steps, N, ...]`` for a rollout, from the specs and from examples ``[N, ...]`` of the outputs."""
+    made: dict[Any, Any] = {**dict(_specs(env.observation_spec)), **outputs}
+    for key in filter(is_state, outputs):
+        flag, path = torch.zeros(env.num_envs, 1, dtype=torch.bool, device=env.device), path_of(key)[1:]
+        made |= {path if len(path) > 1 else path[0]: outputs[key], "is_init": flag, ("next", "is_init"): flag}
+    made |= {("next", *_path(key)): x for key, x in [*_specs(env.observation_spec), *_specs(env.info_spec)]}
+    for key, spec in _specs(env.full_reward_spec):
+        made |= {("next", *_path(key)): spec, ("next", *_total(key)): spec}
+    made |= {("next", *_path(key)): spec for key, spec in _specs(env.full_done_spec) if _path(key)[-1] != "done"}
+    made["next", "step_count"] = torch.zeros(env.num_envs, 1, dtype=torch.int64)
+    if env.masks:
+        made[MASK] = torch.ones(env.num_envs, dtype=torch.bool)
+    device = env.device or torch.device("cpu")
+    return {key: torch.zeros(steps, *x.shape, dtype=x.dtype, device=device) for key, x in made.items()}
 
-    The policy always sees all ``num_envs`` rows (those of other processes are zero) and all its random numbers
-    follow from ``seed``, so the numbers do not depend on how many processes share the environments.
+
+class Share:
+    """Some of the environments, the policy that acts in them, and its memory from step to step.
+
+    Args:
+        simulator: the environments.
+        first: index of the first one in the whole vector.
+        env: the whole vector.
+        actor: the policy, on the simulator's device.
+        outputs: examples of what it writes, ``[N, ...]``.
+        buffers: of :func:`allocate`, the columns of these environments.
+        mode: of the policy's native code (:func:`~pgkit.collectors.policy.trace`).
     """
-    rows = slice(envs.first, envs.first + envs.num_envs)
-    own: Arrays = {key: array[:, rows] for key, array in arrays.items()}
-    results = [own[key] for key in keys]
-    obs, next_obs = own["observation"], own["next", "observation"]
-    reward, terminated = own["next", "reward"][..., 0], own["next", "terminated"][..., 0]
-    truncated, episode_reward = own["next", "truncated"][..., 0], own["next", "episode_reward"][..., 0]
-    step_count = own["next", "step_count"][..., 0]
-    action = own["action"]
-    padded = envs.obs if envs.num_envs == num_envs else np.zeros((num_envs, *envs.obs.shape[1:]), np.float32)
-    policy_input = torch.from_numpy(padded)
-    inputs = [policy_input]
-    memory = _Memory(own, envs, num_envs, rows) if STATE in own else None
-    if memory is not None:
-        inputs += memory.inputs
-    if (envs.step_count == 0).all():
-        envs.reset()
-    torch.default_generator.manual_seed(seed)  # torch.manual_seed costs 0.3 ms
-    for t in range(len(obs)):
-        if padded is not envs.obs:
-            padded[rows] = envs.obs
-        obs[t] = envs.obs
-        if memory is not None:
-            memory.recall(t)
-        for result, output in zip(results, act(*inputs), strict=True):
-            result[t] = output.numpy()[rows]
-        next_obs[t], reward[t], terminated[t], truncated[t] = envs.step(action[t])
-        episode_reward[t], step_count[t] = envs.episode_reward, envs.step_count
-    if memory is not None:
-        memory.keep()
+
+    def __init__(
+        self,
+        simulator: Simulator,
+        first: int,
+        num_envs: int,
+        seed: int,
+        actor: TensorDictModuleBase,
+        outputs: Entries,
+        buffers: Entries,
+        mode: Mode,
+    ) -> None:
+        self.simulator, self._first, self._num_envs, self._seed = simulator, first, num_envs, seed
+        self._steps = len(next(iter(buffers.values())))
+        self._observed = [key for key, _ in _specs(simulator.observation_spec)]
+        self._actions = [key for key, _ in _specs(simulator.action_spec)]
+        self._outputs = list(outputs)
+        self._fresh: Entries | None = None
+        self._memory = memory(actor, simulator.num_envs, simulator.device)
+        self._keys = [*self._observed, *self._memory]
+        self._now, self._decided = _rows(buffers, self._keys), _rows(buffers, self._outputs)
+        counted = buffers | {("next", "step_count"): buffers["next", "step_count"].squeeze(-1)}
+        self._next = _rows(counted, [("next", *_path(key)) for key in self._after()])
+        self._mask = buffers[MASK].unbind(0) if simulator.masks else None
+        spec = simulator.action_spec
+        padded = padded_rows(simulator.num_envs, num_envs)
+        random = random_actions(spec if padded == spec.shape[0] else _padded(spec, padded), self._keys, outputs)
+        self._random = RowPolicy(random, self._now[0], num_envs, first, seed)
+        self.retrace(actor, mode)
+
+    def _after(self) -> list[Key]:
+        """The entries of a step in the order in which they are written."""
+        sim = self.simulator
+        rewards = [key for key, _ in _specs(sim.reward_spec)]
+        ends = [_path(key)[:-1] for key, _ in _specs(sim.done_spec) if _path(key)[-1] == "done"]
+        flags: list[Key] = [*[(*path, "terminated") for path in ends], *[(*path, "truncated") for path in ends]]
+        infos = [key for key, _ in _specs(sim.info_spec)]
+        return [*self._observed, *rewards, *flags, *infos, *[_total(key) for key in rewards], "step_count"]
+
+    def retrace(self, actor: TensorDictModuleBase, mode: Mode) -> None:
+        """Records the policy anew."""
+        act = function_of(actor, self._keys)
+        self._policy = RowPolicy(act, self._now[0], self._num_envs, self._first, self._seed, actor, mode)
+
+    @torch.inference_mode()
+    def collect(self, step: int, random: bool = False) -> None:
+        """Steps the environments through the buffers; ``step`` counts their steps since the beginning."""
+        policy, simulator = self._random if random else self._policy, self.simulator
+        if self._fresh is None:
+            self._fresh = simulator.reset()
+        fresh, remembered, observed = self._fresh, self._memory, self._observed
+        actions = [(key, self._outputs.index(key)) for key in self._actions]
+        states = [at for at, key in enumerate(self._outputs) if is_state(key)]
+        kept = [key for key in remembered if key != "is_init"]
+        with policy.steps(step, self._steps) as noise:
+            for now, decided, after, drawn, t in zip(
+                self._now, self._decided, self._next, noise, range(self._steps), strict=True
+            ):
+                torch._foreach_copy_(now, [*[fresh[key] for key in observed], *remembered.values()])
+                outputs = policy(now, drawn)
+                torch._foreach_copy_(decided, outputs)
+                made = simulator.step({key: outputs[at] for key, at in actions})
+                torch._foreach_copy_(after, [
+                    *[made.next[key] for key in observed], *made.reward.values(), *made.terminated.values(),
+                    *made.truncated.values(), *made.info.values(), *simulator.episode_reward.values(),
+                    simulator.step_count,
+                ])  # fmt: skip
+                fresh = made.fresh
+                if remembered:
+                    remembered = {"is_init": made.begun().unsqueeze(-1)}
+                    remembered |= {key: outputs[at] for key, at in zip(kept, states, strict=True)}
+                if self._mask is not None and made.mask is not None:
+                    self._mask[t].copy_(made.mask)
+        self._fresh, self._memory = fresh, remembered
+
+    def state_dict(self) -> dict[str, Any]:
+        """The simulator's state, and the policy's memory."""
+        return {"simulator": self.simulator.state_dict(), "memory": {k: x.clone() for k, x in self._memory.items()}}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Goes on from :meth:`state_dict`, as the simulator's ``resume`` says."""
+        self._fresh = self.simulator.load_state_dict(state["simulator"])
+        if self._memory and self.simulator.resume == "exact":
+            self._memory = {key: x.to(self.simulator.device) for key, x in state["memory"].items()}
 
 
-class _Memory:
-    """A recurrent policy's state, from step to step; it begins at zero where an episode does, by ``is_init``."""
+def regroup(states: Sequence[dict[str, Any]], bounds: Sequence[int]) -> list[dict[str, Any]]:
+    """The states of shares as those of other shares, from ``bounds[i]`` to ``bounds[i + 1]``.
 
-    def __init__(self, own: Arrays, envs: ArrayEnv, num_envs: int, rows: slice) -> None:
-        self.envs, self.rows = envs, rows
-        self.is_init, self.states, self.next_states = own["is_init"][..., 0], own["recurrent_state"], own[STATE]
-        size = self.states.shape[-1]
-        if envs.memory is None:
-            envs.memory = np.zeros((envs.num_envs, size), np.float32)
-        self.all_init, self.all_states = np.zeros((num_envs, 1), bool), np.zeros((num_envs, size), np.float32)
-        self.inputs = [torch.from_numpy(self.all_init), torch.from_numpy(self.all_states)]
-
-    def recall(self, t: int) -> None:
-        """Lays out and stores what the policy reads at step ``t``."""
-        if t > 0:
-            self.envs.memory = self.next_states[t - 1]
-        self.is_init[t], self.states[t] = self.envs.fresh, self.envs.memory
-        self.all_init[self.rows, 0], self.all_states[self.rows] = self.is_init[t], self.states[t]
-
-    def keep(self) -> None:
-        """After the last step."""
-        self.envs.memory = self.next_states[-1].copy()
-
-
-def _unchecked(entries: dict[Any, Any]) -> TensorDictBase:
-    """A TensorDict of tensors ``[N, T, ...]``; checking each entry costs a tenth of a millisecond a rollout."""
-    shape = next(iter(entries.values())).shape[:2]
-    return TensorDict._new_unsafe(source=entries, batch_size=shape)
+    Raises:
+        UserError: environments whose states cannot be taken apart.
+    """
+    simulators, counts = [state["simulator"] for state in states], len(bounds) - 1
+    if "rows" not in simulators[0]:
+        if len(states) == counts:
+            return list(states)
+        raise UserError(
+            f"the checkpoint is of {len(states)} processes, there are {counts} now, and the states of these "
+            "environments cannot be taken apart: resume with the same --workers"
+        )
+    rows = [row for simulator in simulators for row in simulator["rows"]]
+    kept = {key: torch.cat([state["memory"][key] for state in states]) for key in states[0]["memory"]}
+    parts = [(a - bounds[0], b - bounds[0]) for a, b in pairwise(bounds)]
+    return [
+        {"simulator": simulators[0] | {"rows": rows[a:b]}, "memory": {key: x[a:b] for key, x in kept.items()}}
+        for a, b in parts
+    ]
 
 
-def as_rollout(arrays: Arrays, env: VectorEnv) -> TensorDictBase:
-    """The arrays ``[T, N, ...]`` as a TensorDict ``[N, T]``, without a copy, and ``("next", "done")``."""
-    tensors: dict[Any, Tensor] = {key: torch.from_numpy(array).transpose(0, 1) for key, array in arrays.items()}
-    after = {key[1]: tensors.pop(key) for key in arrays if key[0] == "next"}
-    nested = {key: tensors.pop(key) for key in list(tensors) if isinstance(key, tuple)}
-    now = env.split(tensors.pop("observation")) | tensors
-    after = env.split(after.pop("observation")) | after
-    if "action_mask" in now and not all(x.any(-1).all() for x in choices(env.action_spec, now["action_mask"])):
-        raise UserError("the environment's action_mask allows no action in some state: it must allow at least one")
-    after["done"] = after["terminated"] | after["truncated"]
-    rollout = _unchecked({**now, "next": _unchecked(after)})
-    for key, tensor in nested.items():
-        rollout.set(key, tensor)
-    return rollout
+def as_rollout(buffers: Entries, env: VectorEnv) -> TensorDictBase:
+    """The buffers ``[T, N, ...]`` as a TensorDict ``[N, T]``, without a copy, and ``("next", ..., "done")``."""
+    tensors: dict[Any, Tensor] = {key: x.transpose(0, 1) for key, x in buffers.items()}
+    for key in [key for key in tensors if _path(key)[-1] == "terminated"]:
+        tensors[(*key[:-1], "done")] = tensors[key] | tensors[(*key[:-1], "truncated")]
+    _check(tensors, env)
+    return _nested({_path(key): x for key, x in tensors.items()}, env.groups)
+
+
+def _nested(
+    entries: dict[tuple[str, ...], Tensor], shapes: dict[tuple[str, ...], torch.Size], at: tuple[str, ...] = ()
+) -> TensorDictBase:
+    """Nested TensorDicts; checking each entry costs a tenth of a millisecond a rollout, so none is."""
+    source: dict[str, Any] = {}
+    groups: dict[str, dict[tuple[str, ...], Tensor]] = {}
+    for path, x in entries.items():
+        if len(path) == 1:
+            source[path[0]] = x
+        else:
+            groups.setdefault(path[0], {})[path[1:]] = x
+    for name, group in groups.items():
+        source[name] = _nested(group, shapes, () if name == "next" else (*at, name))
+    batch = next(iter(entries.values())).shape[:2]
+    return TensorDict._new_unsafe(source=source, batch_size=batch + shapes.get(at, torch.Size()))
+
+
+def _check(tensors: dict[Any, Tensor], env: VectorEnv) -> None:
+    """A ``UserError`` for numbers that are not finite, and for masks that allow no action."""
+    for key, _ in _specs(env.observation_spec):
+        for where in (("next", *_path(key)), key):
+            _check_finite(tensors[where], where)
+        if _path(key)[-1] == "action_mask":
+            spec = env.full_action_spec[(*_path(key)[:-1], "action")]
+            if not all(x.any(-1).all() for x in choices(spec, tensors[key])):
+                raise UserError(
+                    "the environment's action_mask allows no action in some state: it must allow at least one"
+                )
+    for key, _ in _specs(env.full_reward_spec):
+        where = ("next", *_path(key))
+        _check_finite(tensors[where], where)
+
+
+def _check_finite(x: Tensor, key: Key) -> None:
+    if x.dtype.is_floating_point and not torch.isfinite(x).all():
+        row, step = (~torch.isfinite(x)).nonzero()[0, :2].tolist()
+        found = x[row, step][~torch.isfinite(x[row, step])].flatten()[0].item()
+        name = ".".join(_path(key))
+        raise UserError(
+            f"'{name}' of environment {row} is {found} at step {step} of the rollout: the update would turn every "
+            "weight into NaN; mend the environment, or clip it in a wrapper (gymnasium.wrappers.TransformObservation)"
+        )
+
+
+def _rows(buffers: Entries, keys: Iterable[Key]) -> list[list[Tensor]]:
+    """For each step, the rows of these entries."""
+    columns = [buffers[key[0] if isinstance(key, tuple) and len(key) == 1 else key].unbind(0) for key in keys]
+    return [list(row) for row in zip(*columns, strict=True)]
+
+
+def _specs(spec: Any) -> list[tuple[Any, Any]]:
+    return [(key, spec[key]) for key in spec.keys(True, True)]
+
+
+def _path(key: Any) -> tuple[str, ...]:
+    return (key,) if isinstance(key, str) else key
+
+
+def _total(key: Any) -> tuple[str, ...]:
+    """The name of the running sum of a reward."""
+    return (*_path(key)[:-1], f"episode_{_path(key)[-1]}")
+
+
+def _padded(spec: Any, rows: int) -> Any:
+    """The spec of more rows."""
+    return spec[:1].expand(rows)

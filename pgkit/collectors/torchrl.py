@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.data import Unbounded
 from torchrl.envs import Compose, EnvBase, InitTracker, RewardSum, StepCounter, TensorDictPrimer, TransformedEnv
 
-from pgkit.collectors.policy import memory
+from pgkit.collectors.actor import check_types, memory
 from pgkit.errors import UserError
 
 
@@ -40,13 +40,13 @@ class TorchRLCollector:
     ) -> None:
         from torchrl.collectors import Collector  # slow to import, and rarely needed
 
-        _check_types(env, actor)
+        check_types(actor, env.fake_tensordict())
         transforms = [RewardSum(), StepCounter()]
         if state := memory(actor, env.batch_size.numel()):
             if not env.batch_size:
                 raise UserError("a recurrent actor reads a batch of environments, this is one: SerialEnv(1, make_env)")
-            size = state["recurrent_state"].shape[-1]
-            transforms += [InitTracker(), TensorDictPrimer(recurrent_state=Unbounded((size,)), expand_specs=True)]
+            primers = {key: Unbounded(x.shape[1:]) for key, x in state.items() if key != "is_init"}
+            transforms += [InitTracker(), TensorDictPrimer(primers, expand_specs=True)]
         env = TransformedEnv(env, Compose(*transforms))
         self.frames, self.total_frames, self.compile_seconds = 0, total_frames, 0.0
         kwargs = {"trust_policy": True, "auto_register_policy_transforms": True} | kwargs
@@ -70,16 +70,3 @@ class TorchRLCollector:
     def shutdown(self) -> None:
         """Ends TorchRL's collector."""
         self.collector.shutdown()
-
-
-def _check_types(env: EnvBase, actor: TensorDictModuleBase) -> None:
-    """A ``UserError`` where the observation is of another floating type than the actor's weights."""
-    types = {p.dtype for p in actor.parameters() if p.dtype.is_floating_point}
-    for key in actor.in_keys:
-        dtype = env.observation_spec[key].dtype if key in env.observation_spec.keys(True, True) else None
-        if dtype is not None and dtype.is_floating_point and types and dtype not in types:
-            found, wanted = (str(x).removeprefix("torch.") for x in (dtype, min(types, key=str)))
-            raise UserError(
-                f"'{key}' is {found}, the actor's weights are {wanted}: convert it (TransformedEnv(env, "
-                "DoubleToFloat())), or the actor with .to(dtype)"
-            )

@@ -7,16 +7,15 @@ from collections.abc import Iterator
 from logging import getLogger
 from typing import Any
 
-import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import EnvBase
 
-from pgkit.collectors.policy import Act, check_env, example, output_keys, random_actions, trace
-from pgkit.collectors.stepping import allocate, as_rollout, fill
-from pgkit.collectors.workers import Workers
+from pgkit.collectors.actor import Beside, example
+from pgkit.collectors.stepping import MASK, Share, allocate, as_rollout, regroup
+from pgkit.collectors.workers import Workers, check_splits
 from pgkit.compiled import Constants, choose
-from pgkit.envs import VectorEnv
-from pgkit.envs.arrays import episode_seed
+from pgkit.envs import VectorEnv, vector_of
 from pgkit.errors import UserError, check_whole_number
 
 
@@ -30,8 +29,11 @@ class VectorCollector:
     The numbers depend on the environment's seed and the weights only: not on ``env.workers``, not on the use made
     of torch's global random generator elsewhere.
 
+    The policy is evaluated where the environments are; a rollout is brought to where the actor is, as a whole.
+
     Args:
-        env: from :func:`pgkit.envs.make`; ``env.workers`` processes collect.
+        env: from :func:`pgkit.envs.make`; ``env.workers`` processes collect. Or any TorchRL environment with one batch
+            dimension or none, transforms included.
         actor: TensorDict module from ``observation`` to ``action`` (and its log-probability). Its parameters are
             read before every rollout.
         frames_per_batch: frames of a rollout, a multiple of ``env.num_envs``.
@@ -41,13 +43,13 @@ class VectorCollector:
         compile: ``on``, ``off``, or ``auto``: where a C++ compiler is there and ``total_frames`` is large enough.
 
     Raises:
-        UserError: sizes that do not fit, an environment of TorchRL's own (transforms included), or an actor that was
-            built for another environment.
+        UserError: sizes that do not fit, an actor that was built for another environment; while collecting,
+            observations or rewards that are not finite.
     """
 
     def __init__(
         self,
-        env: VectorEnv,
+        env: EnvBase,
         actor: TensorDictModuleBase,
         *,
         frames_per_batch: int,
@@ -55,7 +57,9 @@ class VectorCollector:
         init_random_frames: int = 0,
         compile: str = "auto",
     ) -> None:
-        check_env(env, self)
+        env = vector_of(env)
+        if env.workers > 1:
+            check_splits(env)
         check_whole_number(1, frames_per_batch=frames_per_batch)
         if frames_per_batch % env.num_envs:
             raise UserError(
@@ -75,10 +79,9 @@ class VectorCollector:
         self._steps = frames_per_batch // env.num_envs
         steps = None if total_frames < 0 else total_frames / env.num_envs
         self._compile = choose(compile, steps, least_calls=50_000)
-        self._keys = output_keys(actor)
-        self._outputs = dict(zip(self._keys, example(env, actor), strict=True))
+        self._outputs, self._beside = example(env, actor), Beside(actor, env)
         self._workers: Workers | None = None
-        self._act: Act | None = None
+        self._share: Share | None = None
         self._constants: Constants | None = None
 
     def __iter__(self) -> Iterator[TensorDictBase]:
@@ -87,38 +90,40 @@ class VectorCollector:
 
     def rollout(self) -> TensorDictBase:
         """Collects one rollout with the actor's present weights."""
-        seed = episode_seed(self.env.seed, -1 % 2**32, self._rollouts)
-        random = self.frames < self.init_random_frames
+        step, random = self._rollouts * self._steps, self.frames < self.init_random_frames
         if self.env.workers > 1:
-            self._pool().begin(self.actor.state_dict().values(), seed, random)
-            arrays = self._pool().finish()
+            self._pool().begin(self.actor.state_dict().values(), step, random)
+            buffers = self._pool().finish()
         else:
-            obs = self.env.arrays.obs
-            arrays = allocate(self._steps, obs, self._outputs)
-            act = random_actions(self.env.action_spec, self._outputs, self.env.split) if random else self._policy()
-            with torch.random.fork_rng(devices=[]):
-                fill(arrays, self.env.arrays, act, self._keys, self.env.num_envs, seed)
-        self.frames += self.frames_per_batch
+            share = self._alone()
+            share.collect(step, random)
+            buffers = {key: x.clone() for key, x in self._buffers.items()}
+        rollout = as_rollout(buffers, self.env)
+        self.frames += count(rollout)
         self._rollouts += 1
-        return as_rollout(arrays, self.env)
+        return self._beside.bring(rollout)
 
     def state_dict(self) -> dict[str, Any]:
-        """Counters, and every environment's state (see :class:`~pgkit.envs.ArrayEnv`)."""
-        envs = self._pool() if self.env.workers > 1 else self.env.arrays
-        return {"frames": self.frames, "rollouts": self._rollouts, "envs": envs.state_dict()}
+        """Counters, and the state of every environment and of the policy's memory."""
+        shares = self._pool().state_dict() if self.env.workers > 1 else [self._alone().state_dict()]
+        return {"frames": self.frames, "rollouts": self._rollouts, "shares": shares}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restores :meth:`state_dict`, also one taken with another number of workers."""
         self.frames, self._rollouts = state["frames"], state["rollouts"]
-        envs = self._pool() if self.env.workers > 1 else self.env.arrays
-        envs.load_state_dict(state["envs"])
+        say_resume(self.env)
+        if self.env.workers > 1:
+            self._pool().load_state_dict(state["shares"])
+        else:
+            self._alone().load_state_dict(regroup(state["shares"], [0, self.env.num_envs])[0])
 
     def shutdown(self) -> None:
         """Ends the worker processes and closes the environments."""
         if self._workers is not None:
             self._workers.close()
             self._workers = None
-        self.env.close_arrays()
+        self.env.close_simulator()
+        self._share = None
 
     def _pool(self) -> Workers:
         """The workers; they get new weights only, and start again where something else in the actor was replaced."""
@@ -126,7 +131,7 @@ class VectorCollector:
         state = None
         if self._workers is not None and changed:
             getLogger("pgkit").warning(
-                "the workers start again: %s (a buffer changed in place, by fill_, needs no such thing)",
+                "the workers start again: in the actor %s (a buffer changed in place, by fill_, needs no such thing)",
                 changed,
             )
             state = self._workers.state_dict()
@@ -134,19 +139,39 @@ class VectorCollector:
             self._workers = None
         if self._workers is None:
             start = time.perf_counter()
-            self._constants = Constants({"the actor": self.actor})
-            self._workers = Workers(self.env, self.actor, self._steps, self._outputs, self._compile)
+            self._constants, self._beside = Constants({"the actor": self.actor}), Beside(self.actor, self.env)
+            self._workers = Workers(self.env, self._beside.actor, self._steps, self._outputs, self._compile)
             self.compile_seconds += time.perf_counter() - start
             if state is not None:
                 self._workers.load_state_dict(state)
         return self._workers
 
-    def _policy(self) -> Act:
-        """The traced actor, traced again where something that it holds was replaced."""
-        if self._act is None or self._constants is None or self._constants.changed():
+    def _alone(self) -> Share:
+        """All environments in this process; the policy is recorded again where something that it holds was replaced."""
+        if self._share is None or self._constants is None or self._constants.changed():
             start = time.perf_counter()
-            obs = torch.from_numpy(self.env.arrays.obs)
             self._constants = Constants({"the actor": self.actor})
-            self._act = trace(self.actor, obs, self._compile, self.env.split)
+            self._beside = Beside(self.actor, self.env)
+            if self._share is None:
+                self._buffers = allocate(self._steps, self.env, self._outputs)
+                self._share = Share(
+                    self.env.simulator, 0, self.env.num_envs, self.env.seed, self._beside.actor, self._outputs,
+                    self._buffers, self._compile,
+                )  # fmt: skip
+            else:
+                self._share.retrace(self._beside.actor, self._compile)
             self.compile_seconds += time.perf_counter() - start
-        return self._act
+        self._beside.refresh()
+        return self._share
+
+
+def count(rollout: TensorDictBase) -> int:
+    """Frames of a rollout: all, or those whose action counted."""
+    mask = rollout.get(MASK, None)
+    return rollout.numel() if mask is None else int(mask.sum())
+
+
+def say_resume(env: VectorEnv) -> None:
+    """The one line that says what a resume brings back."""
+    exact = "every environment goes on where it was" if env.resume == "exact" else "every environment begins anew"
+    getLogger("pgkit").info("the resumed run: %s (%s)", exact, env.env_id)

@@ -7,25 +7,22 @@ import signal
 import sys
 import traceback
 import weakref
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from itertools import pairwise
 from multiprocessing.connection import Connection
 from typing import Any, NamedTuple
 
 import cloudpickle
-import numpy as np
 import torch
 import torch.multiprocessing as mp
 from tensordict.nn import TensorDictModuleBase
-from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data import TensorSpec
 
-from pgkit.collectors.policy import random_actions, trace
-from pgkit.collectors.stepping import Arrays, allocate, fill
+from pgkit.collectors.stepping import Share, allocate, regroup
 from pgkit.compiled import Mode
-from pgkit.envs import ArrayEnv, VectorEnv
+from pgkit.envs import VectorEnv
 from pgkit.errors import UserError
+from pgkit.seams import Entries
 
 
 class WorkerEnded(RuntimeError):
@@ -33,13 +30,14 @@ class WorkerEnded(RuntimeError):
 
 
 class Workers:
-    """Processes that share some of the environments; :meth:`begin` and :meth:`finish` make one rollout's arrays.
+    """Processes that share some of the environments; :meth:`begin` and :meth:`finish` make one rollout's buffers.
 
-    The rollout and the policy's weights are in shared memory: a rollout costs two messages a process.
+    The rollout and the policy's weights are in shared memory: a rollout costs two messages a process. Each process
+    evaluates the policy on its own rows only.
 
     Args:
         env: all the environments.
-        actor: the policy.
+        actor: the policy, on the CPU.
         steps: steps each environment takes for a rollout.
         outputs: examples of what the policy writes.
         compile: compile the policy.
@@ -51,25 +49,24 @@ class Workers:
         env: VectorEnv,
         actor: TensorDictModuleBase,
         steps: int,
-        outputs: dict[NestedKey, Tensor],
+        outputs: Entries,
         compile: Mode,
         bounds: Sequence[int] | None = None,
     ) -> None:
         self._actor = copy.deepcopy(actor).requires_grad_(False).share_memory()
-        obs = np.zeros((env.num_envs, *env.observation_shape), np.float32)
-        shared = {k: torch.from_numpy(x).share_memory_() for k, x in allocate(steps, obs, outputs).items()}
-        self._arrays: Arrays = {key: tensor.numpy() for key, tensor in shared.items()}
+        self._buffers = {key: x.share_memory_() for key, x in allocate(steps, env, outputs).items()}
         context = _context()
         self._bounds = list(bounds or shares(env))
         self.pipes: list[Connection] = []
         processes = []
         for first, end in pairwise(self._bounds):
             ours, theirs = context.Pipe()
-            share = _Share(
-                cloudpickle.dumps(env.make_env), first, end - first, env.num_envs, env.seed, env.action_spec,
-                self._actor, outputs, shared, compile, env.split,
+            columns = {key: x[:, first:end] for key, x in self._buffers.items()}
+            order = _Order(
+                cloudpickle.dumps(env.make), first, end - first, env.num_envs, env.seed, self._actor, outputs, columns,
+                compile,
             )  # fmt: skip
-            process = context.Process(target=_serve, args=(theirs, share), daemon=True)
+            process = context.Process(target=_serve, args=(theirs, order), daemon=True)
             process.start()
             theirs.close()
             self.pipes.append(ours)
@@ -84,38 +81,30 @@ class Workers:
                 "`if __name__ == '__main__':`, as every worker imports the script; the lines above may tell more"
             ) from error
 
-    def begin(self, weights: Iterable[Tensor], seed: int, random: bool = False) -> None:
-        """Starts a rollout with these weights, the values of the actor's ``state_dict()``."""
+    def begin(self, weights: Iterable[Tensor], step: int, random: bool = False) -> None:
+        """Starts a rollout with these weights, the values of the actor's ``state_dict()``; as :meth:`Share.collect`."""
         self._answers()  # of a rollout that was interrupted (Ctrl-C in a notebook) or is not wanted any more
         with torch.no_grad():
             for mine, theirs in zip(self._actor.state_dict().values(), weights, strict=True):
                 mine.copy_(theirs)
-        self._send([("collect", (seed, random))] * len(self.pipes))
+        self._send([("collect", (step, random))] * len(self.pipes))
 
     def ready(self) -> bool:
         """Whether :meth:`finish` would not wait."""
         return all(pipe.poll() for pipe in self.pipes)
 
-    def finish(self) -> Arrays:
-        """The rollout's arrays ``[T, N, ...]`` of this object's environments, the caller's to keep."""
+    def finish(self) -> Entries:
+        """The rollout's buffers ``[T, N, ...]`` of this object's environments, the caller's to keep."""
         self._answers()
-        return {key: array[:, self._bounds[0] : self._bounds[-1]].copy() for key, array in self._arrays.items()}
+        return {key: x[:, self._bounds[0] : self._bounds[-1]].clone() for key, x in self._buffers.items()}
 
-    def state_dict(self) -> dict[str, Any]:
-        """The environments' state, as one :class:`~pgkit.envs.ArrayEnv` would give it."""
-        parts = self._ask([("state", None)] * len(self.pipes))
-        history = [x for part in parts for x in part["history"]]
-        episode = [x for part in parts for x in part["episode"]]
-        state = {"seed": parts[0]["seed"], "episode": episode, "history": history}
-        return state | {"memory": np.concatenate([part["memory"] for part in parts])} if "memory" in parts[0] else state
+    def state_dict(self) -> list[dict[str, Any]]:
+        """The state of every process's share."""
+        return self._ask([("state", None)] * len(self.pipes))
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Gives every process its share of :meth:`state_dict`."""
-        start = self._bounds[0]
-        cuts = [slice(a - start, b - start) for a, b in pairwise(self._bounds)]
-        keys = [key for key in ("episode", "history", "memory") if key in state]
-        parts = [{"seed": state["seed"], **{key: state[key][c] for key in keys}} for c in cuts]
-        self._ask([("load", part) for part in parts])
+    def load_state_dict(self, states: list[dict[str, Any]]) -> None:
+        """Gives every process its share of :meth:`state_dict`, taken with any number of processes."""
+        self._ask([("load", state) for state in regroup(states, self._bounds)])
 
     def _ask(self, requests: list[Any]) -> list[Any]:
         self._answers()
@@ -163,42 +152,50 @@ def shares(env: VectorEnv) -> list[int]:
     return [round(i * env.num_envs / env.workers) for i in range(env.workers + 1)]
 
 
-class _Share(NamedTuple):
+def check_splits(env: VectorEnv) -> None:
+    """A ``UserError`` for environments that other processes cannot make or share memory with."""
+    if env.device is not None and env.device.type != "cpu":
+        raise UserError(f"workers={env.workers} with environments on {env.device}: one process steps them, workers=1")
+    if not env.splits:
+        raise UserError(
+            f"the {env.env_id} given is in this process, workers make their own: give envs.make a function that "
+            "makes one, or use collectors.VectorCollector with workers=1"
+        )
+
+
+class _Order(NamedTuple):
     """What a worker is given."""
 
-    make_env: bytes
+    make: bytes
     first: int
     count: int
     num_envs: int
     seed: int
-    action_spec: TensorSpec
     actor: TensorDictModuleBase
-    outputs: dict[NestedKey, Tensor]
-    shared: dict[NestedKey, Tensor]
+    outputs: Entries
+    buffers: Entries
     compile: Mode
-    split: Callable[[Tensor], dict[str, Tensor]]
 
 
-def _serve(pipe: Connection, share: _Share) -> None:
+def _serve(pipe: Connection, order: _Order) -> None:
     """A worker's life: answers ``(answer, failure)`` to every request until the pipe closes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
     try:
         torch.set_num_threads(1)
-        envs = ArrayEnv(cloudpickle.loads(share.make_env), share.count, share.seed, share.first)
-        act = trace(share.actor, torch.zeros(share.num_envs, *envs.obs.shape[1:]), share.compile, share.split)
-        random_act = random_actions(share.action_spec, share.outputs, share.split)
-        arrays = {key: tensor.numpy() for key, tensor in share.shared.items()}
+        simulator = cloudpickle.loads(order.make)(order.first, order.count, order.seed)
+        share = Share(
+            simulator, order.first, order.num_envs, order.seed, order.actor, order.outputs, order.buffers, order.compile
+        )
         pipe.send((None, None))
         while True:
             request, argument = pipe.recv()
             answer = None
             if request == "collect":
-                seed, random = argument
-                fill(arrays, envs, random_act if random else act, list(share.outputs), share.num_envs, seed)
+                share.collect(*argument)
             elif request == "state":
-                answer = envs.state_dict()
+                answer = share.state_dict()
             else:
-                envs.load_state_dict(argument)
+                share.load_state_dict(argument)
             pipe.send((answer, None))
     except (EOFError, ConnectionError):
         pass

@@ -22,8 +22,10 @@ class Temperature(nn.Module):
             add the log of half the range of each dimension for others.
         alpha_init: its value at the start, above 0.
         min_alpha, max_alpha: bounds of :math:`\alpha`; None: none.
+        trained: False holds it still, as a buffer.
     """
 
+    log_alpha: Tensor
     target_entropy: Tensor
 
     def __init__(
@@ -33,6 +35,7 @@ class Temperature(nn.Module):
         *,
         min_alpha: float | None = None,
         max_alpha: float | None = None,
+        trained: bool = True,
     ) -> None:
         super().__init__()
         if alpha_init <= 0:
@@ -41,7 +44,10 @@ class Temperature(nn.Module):
             "target_entropy", torch.tensor(float(target_entropy), dtype=torch.float64), persistent=False
         )
         self.bounds = (log(min_alpha) if min_alpha else None, log(max_alpha) if max_alpha else None)
-        self.log_alpha = nn.Parameter(torch.tensor(log(alpha_init)))
+        if trained:
+            self.log_alpha = nn.Parameter(torch.tensor(log(alpha_init)))  # float32: a compiled step writes it
+        else:
+            self.register_buffer("log_alpha", torch.tensor(log(alpha_init), dtype=torch.float64))
 
     @property
     def alpha(self) -> Tensor:

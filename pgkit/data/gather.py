@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from typing import cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -64,7 +65,7 @@ def _observations(
 ) -> tuple[TensorDictBase, TensorDictBase]:
     """Observations at the rows ``index``, and at ``next_row``, the step after the rows ``last``."""
     whole = data["observations"].exclude(*stacked) if stacked else data["observations"]
-    now, after = whole[index], whole[next_row]
+    now, after = cast(TensorDictBase, whole[index]), cast(TensorDictBase, whole[next_row])
     if not stacked:
         return now, after
     older = data["frames"]["older"]

@@ -1,4 +1,4 @@
-"""What an environment's first reset and first step return, against Gymnasium's interface and its own spaces."""
+"""What an environment's resets and steps return, against Gymnasium's interface and its own spaces."""
 
 from __future__ import annotations
 
@@ -9,6 +9,10 @@ import numpy as np
 from gymnasium import spaces
 
 from pgkit.errors import UserError
+
+# the usual types of flags and rewards, which need no look
+FLAGS = {bool, np.bool_}
+NUMBERS = {float, int, np.float64, np.float32, np.int64}
 
 
 def checked_reset(env: gym.Env, seed: int) -> tuple[Any, dict[str, Any]]:
@@ -42,6 +46,16 @@ def check_step(env: gym.Env, action: np.ndarray, result: Any) -> None:
     if np.ndim(reward) or isinstance(reward, str) or not np.isfinite(np.asarray(reward, dtype=float)):
         found = f"of shape {np.shape(reward)}: return one number" if np.ndim(reward) else f"{reward!r}: return a number"
         raise UserError(f"{_name(env)}.step returned a reward {found}, float(reward)")
+    for name, flag in zip(("terminated", "truncated"), result[2:4], strict=True):
+        if np.ndim(flag) or np.asarray(flag).dtype.kind not in "bi":
+            raise UserError(f"{_name(env)}.step returned {name}={flag!r}: return True or False")
+
+
+def misshapen(env: gym.Env, method: str, error: Exception) -> UserError:
+    """What to say where an observation does not go into the row of its environment."""
+    return UserError(
+        f"{_name(env)}.{method} returned an observation that is not of its observation_space: {error}: make them agree"
+    )
 
 
 def _check_observation(env: gym.Env, method: str, obs: Any) -> None:

@@ -1,61 +1,89 @@
-"""One id scheme for Gymnasium and dm_control."""
+"""Environments of every kind behind one function."""
 
 from __future__ import annotations
 
-import dataclasses
-import difflib
-import warnings
+import inspect
+import sys
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from logging import getLogger
+from typing import Any, NamedTuple
 
 import gymnasium as gym
+import torch
+from gymnasium.vector import VectorEnv as GymVectorEnv
 from torchrl.envs import EnvBase
 
 from pgkit.envs.action_repeat import ActionRepeat
+from pgkit.envs.gym_list import Gymnasium
+from pgkit.envs.gym_vector import GymnasiumVector
+from pgkit.envs.ids import make_one
+from pgkit.envs.numpy_entries import Info
+from pgkit.envs.seeding import episode_seed
+from pgkit.envs.torch_batch import Torch
 from pgkit.envs.vector import VectorEnv
 from pgkit.errors import UserError, check_whole_number
+from pgkit.seams import Simulator
+
+
+class Settings(NamedTuple):
+    """What :func:`make` was asked for besides the environment."""
+
+    device: torch.device | str | None = None
+    action_repeat: int = 1
+    flatten: bool = True
+    info: Info = ()
+    time_limit: int | None = None
 
 
 def make(
-    env_id: str | Callable[[], gym.Env],
-    num_envs: int = 1,
+    env_id: str | EnvBase | GymVectorEnv | Callable[..., Any],
+    num_envs: int | None = None,
     *,
     seed: int = 0,
+    device: torch.device | str | None = None,
     workers: int = 1,
     action_repeat: int = 1,
     flatten: bool = True,
+    info: Info = (),
     max_episode_steps: int | None = None,
     **kwargs: Any,
 ) -> VectorEnv:
     """Makes a vector of environments.
 
     Args:
-        env_id: a Gymnasium id, ``dm_control/<domain>-<task>-v0`` (also ``dmc:<domain>-<task>``), or a function or
-            class that makes one environment, a new one at every call.
-        num_envs: number of environments.
+        env_id: a Gymnasium id, ``dm_control/<domain>-<task>-v0`` (also ``dmc:<domain>-<task>``); a vector of
+            Gymnasium's (``gymnasium.make_vec(...)``); a TorchRL ``EnvBase`` with one batch dimension or none; or a
+            function or class. What that returns decides what it is: one ``gym.Env`` (or ``dm_env``), a new one at
+            every call, or one of the former. It gets ``num_envs``, ``seed`` and ``device`` if it names them.
+        num_envs: number of environments; 1 by default, and what an object that is given has.
         seed: seed of the whole vector; environment ``i`` gets its own stream.
+        device: where a TorchRL environment is to be; NumPy environments are on the CPU.
         workers: processes that share the environments when a :class:`~pgkit.collectors.VectorCollector` collects.
         action_repeat: steps of the simulator for each action; a frame is then one decision, its reward their sum.
         flatten: a Dict observation becomes one vector, ``observation``; False keeps its entries apart, each under its
-            own name: for one encoder per entry (:func:`pgkit.modules.dict_encoder`) and for action masks.
+            own name and in its own type: for one encoder per entry (:func:`pgkit.modules.dict_encoder`) and for
+            action masks.
+        info: entries of ``info`` that reach the rollout under ``("next", name)``: names of single numbers, or a
+            mapping from names to TorchRL specs of one environment's.
         max_episode_steps: time limit; None: the id's own, which a function or class has none of.
         **kwargs: passed to ``gymnasium.make``, to the dm_control task, or to the function or class.
 
     Raises:
         UserError: the id is unknown (the message has the nearest names), a package is missing (it has the
-            install line), there are more workers than environments, there is no Dict to keep apart, or ``env_id`` is an
-            environment.
+            install line), there are more workers than environments, there is no Dict to keep apart, or a setting is
+            not one for this kind of environment.
     """
-    if not (isinstance(env_id, str) or callable(env_id)) or isinstance(env_id, gym.Env | EnvBase):
-        raise UserError(
-            f"envs.make takes an id, or a function or class that makes one environment, this is a "
-            f"{type(env_id).__name__}: envs.make(lambda: ...)"
-        )
     if seed is None:
         raise UserError("seed=None: give a whole number; numpy.random.randint(2**31) is another in every run")
     check_whole_number(0, seed=seed, num_envs=num_envs, workers=workers)
     check_whole_number(1, action_repeat=action_repeat)
+    if isinstance(env_id, EnvBase | GymVectorEnv):
+        if workers > 1 or kwargs:
+            what = f"workers={workers}" if workers > 1 else f"{next(iter(kwargs))}=..."
+            raise UserError(f"{what} with an environment that is made already: give a function that makes one")
+        return _adopt(env_id, num_envs, seed, Settings(device, action_repeat, flatten, info, max_episode_steps))
+    num_envs = 1 if num_envs is None else num_envs
     if num_envs < 1 or workers < 1 or workers > num_envs:
         raise UserError(
             f"num_envs={num_envs}, workers={workers}: every worker needs at least one environment; "
@@ -64,122 +92,121 @@ def make(
     limited = isinstance(env_id, str) and not env_id.startswith(("dm_control/", "dmc:"))  # by Gymnasium
     if limited and max_episode_steps is not None:
         kwargs["max_episode_steps"] = max_episode_steps
-    make_env = partial(make_one, env_id, **kwargs) if isinstance(env_id, str) else partial(env_id, **kwargs)
-    if max_episode_steps is not None and not limited:
-        make_env = partial(_limit, make_env, max_episode_steps)
-    if action_repeat > 1:
-        make_env = partial(_repeat, make_env, action_repeat)
-    env = VectorEnv(make_env, num_envs, seed, workers, flatten)
+    settings = Settings(device, action_repeat, flatten, info, None if limited else max_episode_steps)
+    function = _function(env_id, kwargs)
+    env = VectorEnv(partial(_share, function, settings), num_envs, seed, workers)
     env.env_id = env_id if isinstance(env_id, str) else getattr(env_id, "__qualname__", type(env_id).__name__)
     if action_repeat > 1:
         env.env_id += f" (action repeat {action_repeat})"
     return env
 
 
-def _limit(make_env: Callable[[], gym.Env], steps: int) -> gym.Env:
-    return gym.wrappers.TimeLimit(make_env(), steps)
+def vector_of(env: Any) -> VectorEnv:
+    """What :func:`make` makes of a TorchRL environment or of a simulator; what it made stays as it is.
+
+    The seed of any other environment is drawn from torch's global generator.
+    """
+    if isinstance(env, Simulator):
+        return VectorEnv(lambda first, count, seed: env, splits=False)
+    if not isinstance(env, EnvBase):
+        raise UserError(
+            f"pgkit plays what envs.make gives, a {type(env).__name__} is none of that: envs.make(id or function)"
+        )
+    return env if isinstance(env, VectorEnv) else make(env, seed=int(torch.randint(2**31, ())))
 
 
-def _repeat(make_env: Callable[[], gym.Env], times: int) -> gym.Env:
-    return ActionRepeat(make_env(), times)
+def _adopt(env: EnvBase | GymVectorEnv, num_envs: int | None, seed: int, settings: Settings) -> VectorEnv:
+    """An environment that is there already."""
+    if isinstance(env, VectorEnv):
+        raise UserError("envs.make was given what envs.make gives: use it as it is")
+    adopted = VectorEnv(lambda first, count, seed: _simulator(env, seed, first, settings), 1, seed, splits=False)
+    if num_envs not in (None, adopted.num_envs):
+        raise UserError(f"num_envs={num_envs}: the {type(env).__name__} given is {adopted.num_envs}: leave it out")
+    adopted.env_id = type(env).__name__
+    return adopted
 
 
-def make_one(env_id: str, **kwargs: Any) -> gym.Env:
-    """Makes one environment; ids and errors as in :func:`make`."""
-    if env_id.startswith("dmc:"):
-        env_id = f"dm_control/{env_id.removeprefix('dmc:')}-v0"
-    try:
-        if "mujoco" in _entry_point(env_id):
-            _hear_mujoco()
-        if env_id.startswith("dm_control/"):
-            return _make_dm_control(env_id, **kwargs)
-        spec = gym.registry.get(env_id)
-        known = env_id if spec is None else dataclasses.replace(spec, order_enforce=False)  # always reset before a step
-        return gym.make(known, disable_env_checker=True, **kwargs)
-    except gym.error.UnregisteredEnv as error:
-        if env_id.startswith("ALE/") and not any(known.startswith("ALE/") for known in gym.registry):
+def _function(env_id: Any, kwargs: dict[str, Any]) -> Callable[..., Any]:
+    if isinstance(env_id, str):
+        return partial(make_one, env_id, **kwargs)
+    if not callable(env_id) or isinstance(env_id, gym.Env):
+        raise UserError(
+            f"envs.make takes an id, a function or class that makes an environment, a gymnasium.vector.VectorEnv or a "
+            f"TorchRL EnvBase, this is a {type(env_id).__name__}: envs.make(lambda: ...)"
+        )
+    return partial(env_id, **kwargs)
+
+
+def _share(function: Callable[..., Any], settings: Settings, first: int, count: int, seed: int) -> Simulator:
+    """The environments ``first`` to ``first + count``: what the function makes decides how."""
+    own_seed = seed if first == 0 else episode_seed(seed, first, 0)
+    given = {"num_envs": count, "seed": own_seed, "device": settings.device}
+    names = _named(function) - {name for name, value in given.items() if value is None}
+    made = function(**{name: given[name] for name in names & given.keys()})
+    if isinstance(made, EnvBase | GymVectorEnv):
+        simulator = _simulator(made, own_seed, first, settings)
+        if simulator.num_envs != count:
             raise UserError(
-                f"environment '{env_id}' needs ale-py: pip install ale-py, then give its id as ale_py:{env_id}"
-            ) from error
-        raise _unknown(env_id, [known for known in gym.registry if not _successor(known)]) from error
-    except (gym.error.DependencyNotInstalled, ImportError) as error:
-        raise _not_installed(env_id, error) from error
-    except gym.error.Error as error:
-        raise UserError(f"environment '{env_id}': {str(error).splitlines()[0]}") from error
-    except TypeError as error:
-        if not kwargs or "argument" not in str(error):
-            raise
-        raise UserError(f"environment '{env_id}' cannot be made with these settings: {error}") from error
+                f"the function made {simulator.num_envs} environments where num_envs={count}: let it take num_envs"
+            )
+        return simulator
+    rest = []
+    for i in range(first + 1, first + count):
+        given["seed"] = episode_seed(seed, i, 0)
+        rest.append(function(**{name: given[name] for name in names & given.keys()}))
+    _warn_of_statistics(made)
+    envs = [_one(env, settings) for env in (made, *rest)]
+    return Gymnasium(envs, seed, first, settings.flatten, settings.info)
 
 
-def _not_installed(env_id: str, error: Exception) -> UserError:
-    module, colon, _ = env_id.partition(":")
-    cause = error.__cause__ or error
-    if colon and getattr(cause, "name", None) not in (None, module):
-        return UserError(f"environment '{env_id}': importing '{module}' failed ({cause})")
-    if colon:
-        return UserError(f"environment '{env_id}': no module '{module}' to import, neither here nor installed")
-    if newest := _successor(env_id):
-        return UserError(f"environment '{env_id}' is one of Gymnasium's former ones: use {newest}")
-    reason = str(error).splitlines()[0].rstrip(".")
-    return UserError(
-        f"environment '{env_id}' needs a package that is not installed ({reason}): pip install \"{_extra(env_id)}\""
-    )
+def _named(function: Any) -> set[str]:
+    """The arguments that a function or class names and that are not given yet."""
+    taken: set[str] = set()
+    while isinstance(function, partial):
+        taken |= function.keywords.keys()
+        function = function.func
+    try:
+        return set(inspect.signature(function.__init__ if isinstance(function, type) else function).parameters) - taken
+    except (TypeError, ValueError):  # built in
+        return set()
 
 
-def _successor(env_id: str) -> str | None:
-    """The newest version of an environment, if MuJoCo's version 2 or 3 is asked for; those live in another package."""
-    name, _, version = env_id.rpartition("-v")
-    if version not in ("2", "3"):
-        return None
-    newest = max((spec.version or 0 for spec in gym.registry.values() if spec.name == name), default=0)
-    return f"{name}-v{newest}" if newest > 3 else None
+def _simulator(env: EnvBase | GymVectorEnv, seed: int, first: int, settings: Settings) -> Simulator:
+    if settings.action_repeat > 1 or settings.time_limit is not None:
+        what = "action_repeat" if settings.action_repeat > 1 else "max_episode_steps"
+        raise UserError(
+            f"{what}= is for single Gymnasium environments, this is a {type(env).__name__}: use one of its library's "
+            "wrappers (TorchRL: StepCounter(max_steps=...), FrameSkipTransform(...))"
+        )
+    if isinstance(env, GymVectorEnv):
+        return GymnasiumVector(env, seed, first, settings.flatten, settings.info)
+    env = env if settings.device is None else env.to(settings.device)
+    return Torch(env, seed, first, settings.info)
 
 
-def _entry_point(env_id: str) -> str:
-    if env_id.startswith("dm_control/"):
-        return "dm_control.mujoco"
-    spec = gym.registry.get(env_id)
-    return str(spec.entry_point) if spec else ""
+def _warn_of_statistics(env: Any) -> None:
+    """Says that a wrapper's statistics are its own: a resume and an evaluation begin with none."""
+    while isinstance(env, gym.Wrapper):
+        if isinstance(env, gym.wrappers.NormalizeObservation | gym.wrappers.NormalizeReward):
+            getLogger("pgkit").warning(
+                "%s keeps statistics that evaluation and a resume begin anew: use --normalize-obs "
+                "(modules.ObsNormalizer) and --scale-returns, which are part of the checkpoint", type(env).__name__,
+            )  # fmt: skip
+        env = env.env
 
 
-def _hear_mujoco() -> None:
-    """MuJoCo's warnings become Python's, deprecations in Gymnasium's model files left out; no MUJOCO_LOG.TXT."""
-    import mujoco
-
-    def hear(message: bytes | str) -> None:
-        text = message.decode() if isinstance(message, bytes) else message
-        if "deprecated" not in text:
-            warnings.warn(f"MuJoCo: {text}", RuntimeWarning, stacklevel=2)
-
-    mujoco.set_mju_user_warning(hear)
-
-
-def _make_dm_control(env_id: str, **kwargs: Any) -> gym.Env:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # glfw says at import that there is no display
-        from dm_control import suite
+def _one(env: Any, settings: Settings) -> gym.Env:
+    """One Gymnasium environment with its wrappers."""
+    dm_env = sys.modules.get("dm_env")
+    if dm_env is not None and isinstance(env, dm_env.Environment):
         from shimmy.dm_control_compatibility import DmControlCompatibilityV0
-    _hear_mujoco()  # again: dm_control has put its own hearer in place
-    domain, _, task = env_id.removeprefix("dm_control/").removesuffix("-v0").partition("-")
-    tasks = [(d, t) for d, t in suite.ALL_TASKS]
-    if (domain, task) not in tasks:
-        raise _unknown(env_id, [f"dm_control/{d}-{t}-v0" for d, t in tasks])
-    rendering = {key: kwargs.pop(key) for key in ("render_mode", "render_kwargs") if key in kwargs}
-    return DmControlCompatibilityV0(suite.load(domain, task, task_kwargs=kwargs or None), **rendering)
 
-
-def _unknown(env_id: str, known: list[str]) -> UserError:
-    nearest = difflib.get_close_matches(env_id, known, n=3, cutoff=0.4)
-    hint = f"; the nearest names are {', '.join(nearest)}" if nearest else "; see gymnasium.pprint_registry()"
-    return UserError(f"unknown environment id '{env_id}'{hint}; where a package registers it: PACKAGE:{env_id}")
-
-
-def _extra(env_id: str) -> str:
-    if env_id.startswith("dm_control/"):
-        return "shimmy[dm-control]"
-    entry = _entry_point(env_id)
-    for family in ("box2d", "mujoco", "toy_text", "classic_control"):
-        if family in entry:
-            return f"gymnasium[{family.replace('_', '-')}]"
-    return "gymnasium[all]"
+        env = DmControlCompatibilityV0(env)
+    if not isinstance(env, gym.Env):
+        raise UserError(
+            f"the function that makes an environment made a {type(env).__name__}: it must make a gym.Env, a "
+            "gymnasium.vector.VectorEnv, a TorchRL EnvBase or a dm_control environment"
+        )
+    if settings.time_limit is not None:
+        env = gym.wrappers.TimeLimit(env, settings.time_limit)
+    return ActionRepeat(env, settings.action_repeat) if settings.action_repeat > 1 else env

@@ -15,7 +15,6 @@ from tensordict import TensorDict
 from torch import Tensor
 from torchrl.data import Bounded, Composite, Unbounded
 
-from pgkit.envs.prompt_arrays import PromptArrays
 from pgkit.envs.prompt_gym import GymTask
 from pgkit.envs.prompt_tasks import Addition, Countdown, Reward, Sorting, Task
 from pgkit.envs.tokenizers import Characters, Tokenizer
@@ -146,7 +145,6 @@ class Prompts:
         self.done_spec = Composite(done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=(batch,))
         self.episode_reward: Entries = {"reward": torch.zeros(batch, 1)}
         self.step_count = torch.zeros(batch, dtype=torch.int64)
-        self.arrays = PromptArrays(self)
         self.observation_spec_unbatched, self.action_spec_unbatched = self.observation_spec[0], acted[0]
 
     def set_seed(self, seed: int) -> None:

@@ -5,7 +5,12 @@ from __future__ import annotations
 from functools import partial
 from typing import Any
 
-from tensordict.nn import ProbabilisticTensorDictModule, ProbabilisticTensorDictSequential, TensorDictModule
+from tensordict.nn import (
+    CompositeDistribution,
+    ProbabilisticTensorDictModule,
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+)
 from tensordict.utils import NestedKey
 from torch.distributions import Distribution
 from torchrl.data import Composite, TensorSpec
@@ -39,6 +44,8 @@ def refuse_stochastic(loss: str, actor: TensorDictModule) -> None:
 def need_kind(loss: str, actor: TensorDictModule, discrete: bool) -> None:
     """Raises ``UserError`` unless the actor's action is one discrete choice, or continuous."""
     for kind in _kinds(actor):
+        if kind is CompositeDistribution:
+            continue
         if discrete and not kind.has_rsample and not hasattr(kind, "logits"):
             raise UserError(
                 f"{loss} takes one discrete action, this actor draws {kind.__name__} ones: losses.ClipPPOLoss and "

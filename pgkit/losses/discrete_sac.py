@@ -36,7 +36,7 @@ class DiscreteSACLoss(SoftQLoss):
     https://arxiv.org/abs/1611.01144).
 
     Defaults that differ from TorchRL's: the critics' loss is the squared error (there ``smooth_l1``), ``gamma`` is
-    given here, the number of actions is read off the first batch where ``num_actions`` is not given, the importance
+    given here, the number of actions is read off the batch where ``num_actions`` is not given, the importance
     weights of a prioritized replay apply to the critics alone.
 
     Args:

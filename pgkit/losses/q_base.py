@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, TypedDict
+from typing import Any, TypedDict, TypeVar
 
 import torch
 from tensordict import TensorDictBase
@@ -22,6 +22,7 @@ from pgkit.losses.base import Loss
 
 Critics = TensorDictModule | Sequence[TensorDictModule]
 Members = Tensor | slice | None
+Value = TypeVar("Value", Tensor, Returns)
 
 
 class QSettings(TypedDict, total=False):
@@ -42,7 +43,7 @@ class QLoss(Loss):
 
     It holds the networks as TorchRL does (``qvalue_network_params``, ``target_qvalue_network_params``, ...), owns the
     discount, names the keys, and gives subclasses these verbs: :meth:`act` (for a deterministic actor :meth:`action`),
-    :meth:`min_q`, :meth:`target`, :meth:`outputs`, :meth:`regress`, :meth:`q`.
+    :meth:`min_q`, :meth:`target`, :meth:`outputs`, :meth:`regress`, :meth:`q`, :meth:`write_priority`.
 
     Args:
         actor_network: probabilistic actor, or a deterministic one.
@@ -197,15 +198,20 @@ class QLoss(Loss):
         """The critics' values ``[*B, critics]`` of ``action`` at the batch's observations."""
         return self.head.mean(self.outputs(batch, action, params, members))
 
-    def target(self, batch: TensorDictBase, next_returns: Returns) -> Returns:
-        r"""The bootstrapped target :math:`r + \gamma^n (1 - \text{terminated}) Z(s_{t+n})`, ``[*B]``."""
+    def target(self, batch: TensorDictBase, next_value: Value) -> Value:
+        r"""The bootstrapped target :math:`r + \gamma^n (1 - \text{terminated}) V(s_{t+n})`, ``[*B]``.
+
+        Of a number ``[*B]`` or of a distribution of returns; of augmented copies, the mean over them.
+        """
         keys, after = self.tensor_keys, batch["next"]
         reward, terminated = (after[key].reshape(batch.batch_size) for key in (keys.reward, keys.terminated))
-        steps = batch.get(keys.steps_to_next_obs, None)
-        steps = None if steps is None else steps.reshape(batch.batch_size)
-        gamma = self.gamma.to(next_returns.dtype)  # gamma ** steps would be float64 for any
-        target = bootstrap_target(reward, next_returns, terminated, gamma, steps)
-        return target.mixed() if self.augmented else target
+        gamma, steps = self.gamma.to(next_value.dtype), batch.get(keys.steps_to_next_obs, None)
+        if steps is not None:  # TorchRL's MultiStep drops the 1; a power of whole numbers would be float32 for any
+            steps = steps.reshape(batch.batch_size).to(gamma.dtype)
+        target: Any = bootstrap_target(reward, next_value, terminated, gamma, steps)
+        if not self.augmented:
+            return target
+        return target.mixed() if isinstance(target, Returns) else target.mean(0, keepdim=True).expand_as(target)
 
     def regress(self, batch: TensorDictBase, outputs: Tensor, target: Returns) -> tuple[Tensor, Tensor]:
         """The loss of the critics' ``outputs [*B, critics, size]`` at the target, reduced, and their values.
@@ -216,11 +222,14 @@ class QLoss(Loss):
             The loss and ``[*B, critics]``.
         """
         q = self.head.mean(outputs)
-        error = q.detach() - target.mean.unsqueeze(-1)
-        batch.set(self.tensor_keys.priority, error.abs().amax(-1))
+        self.write_priority(batch, q - target.mean.unsqueeze(-1))
         weight = batch.get(self.tensor_keys.priority_weight, None)
         loss = self.head.loss(outputs, target).sum(-1)
         return self.reduce(loss if weight is None else loss * weight.reshape(batch.batch_size), batch), q
+
+    def write_priority(self, batch: TensorDictBase, td_error: Tensor) -> None:
+        """Writes the largest error of the critics, ``[*B, critics]`` in absolute value, into the batch."""
+        batch.set(self.tensor_keys.priority, td_error.detach().abs().amax(-1))
 
     def first(self, batch: Any) -> Any:
         """What the actor learns on, of a batch or a tensor: all of it, of augmented copies the first."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import torch
@@ -12,7 +13,7 @@ from torch import Tensor, nn
 from torchrl.data import TensorSpec
 from typing_extensions import Unpack
 
-from pgkit.controllers import FixedTemperature, Temperature
+from pgkit.controllers import Temperature
 from pgkit.errors import UserError
 from pgkit.functional import ensemble_mean, random_subset, same_shape, twin_minimum
 from pgkit.losses.actors import action_spec_of, dimensions, need_distribution, need_kind
@@ -93,11 +94,19 @@ class SoftQLoss(QLoss):
         self._automatic = temperature is None and target is None
         if temperature is not None:
             self.temperature: Any = _checked(temperature)
-        elif fixed_alpha:
-            self.temperature = FixedTemperature(alpha_init)
         else:  # where the target is not known yet, each batch adds it to 0
-            self.temperature = Temperature(target or 0.0, alpha_init, min_alpha=min_alpha, max_alpha=max_alpha)
-            self.log_alpha = self.temperature.log_alpha  # by TorchRL's name
+            bounds = {"min_alpha": min_alpha, "max_alpha": max_alpha}
+            self.temperature = Temperature(target or 0.0, alpha_init, **bounds, trained=not fixed_alpha)
+            if fixed_alpha:  # by TorchRL's name
+                self.register_buffer("log_alpha", self.temperature.log_alpha)
+            else:
+                self.log_alpha = self.temperature.log_alpha
+
+    def _apply(self, fn: Callable[[Tensor], Tensor]) -> SoftQLoss:
+        super()._apply(fn)
+        if "log_alpha" in self._buffers:
+            self._buffers["log_alpha"] = self.temperature.log_alpha  # it is another, of the new type or device
+        return self
 
     def automatic_entropy(self, spec: Any) -> float | None:
         """The target entropy that ``auto`` means: minus the dimensions of the action; None without its spec."""
@@ -181,11 +190,8 @@ class SoftQLoss(QLoss):
         return ["loss_actor", "loss_qvalue", "loss_alpha", "alpha", "entropy", "q_value"]
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
-        before = state_dict.get(f"{prefix}log_alpha")  # all that was saved when this loss had no temperature block
-        if before is not None and isinstance(self.temperature, FixedTemperature):
-            state_dict.setdefault(f"{prefix}temperature.alpha", state_dict.pop(f"{prefix}log_alpha").exp())
-        elif before is not None:
-            state_dict.setdefault(f"{prefix}temperature.log_alpha", before)
+        if f"{prefix}log_alpha" in state_dict:  # all that was saved when this loss had no temperature block
+            state_dict.setdefault(f"{prefix}temperature.log_alpha", state_dict[f"{prefix}log_alpha"])
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
 

@@ -186,9 +186,9 @@ def _check(spec: Any, key: NestedKey) -> None:
         return
     if not spec.dtype.is_floating_point:
         raise UserError(f"'{key}' is {spec.dtype}, images are uint8, or floats within [0, 1]")
-    space = spec.space if isinstance(spec, Bounded) else None
-    if space is None:
+    if not isinstance(spec, Bounded):
         return
+    space: Any = spec.space
     low, high = float(space.low.min()), float(space.high.max())
     if low < 0 or high > 1:
         raise UserError(

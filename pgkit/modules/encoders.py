@@ -30,5 +30,6 @@ class DictEncoder(nn.Module):
         self.encoders = nn.ModuleList(encoders.values())
 
     def forward(self, *entries: Tensor) -> Tensor:
-        numbers = [x.float() if x.dtype is torch.bool else x for x in entries]
+        images = [x.dtype is torch.uint8 and x.ndim > 2 for x in entries]
+        numbers = [x if x.is_floating_point() or image else x.float() for x, image in zip(entries, images, strict=True)]
         return torch.cat([encoder(x) for encoder, x in zip(self.encoders, numbers, strict=True)], -1)

@@ -165,8 +165,9 @@ def restored(
         raise UserError(f"{run_dir} has no evaluation yet, so no best policy: ask for the latest (--which latest)")
     saved = checkpoint.load(folder / f"{which}.pt")
     built, args, env = rebuild(run_dir, make, trust)
-    state = saved["states"].get("agent", {})
-    if only_actor:
-        built, state = Agent(built.actor), {**state, "parts": {"actor": state.get("parts", {}).get("actor", {})}}
-    checkpoint.restore({"agent": built}, {"agent": state}, folder / f"{which}.pt")
+    with checkpoint.damage(run_dir):
+        state = saved["states"]["agent"]
+        if only_actor:
+            built, state = Agent(built.actor), {**state, "parts": {"actor": state["parts"]["actor"]}}
+        checkpoint.restore({"agent": built}, {"agent": state}, folder / f"{which}.pt")
     return built, args, env, saved["frames"]

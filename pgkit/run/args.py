@@ -127,7 +127,7 @@ def imported(name: str) -> Callable[[gym.Env], gym.Env]:
     if not (module and colon and function):
         raise UserError(f"--wrapper {name}: give module:function, as in my_module:wrap")
     try:
-        found = vars(importlib.import_module(module)).get(function)
+        found: Any = vars(importlib.import_module(module)).get(function)
     except ModuleNotFoundError as error:
         if error.name != module:
             raise

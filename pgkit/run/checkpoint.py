@@ -38,6 +38,8 @@ def damage(run_dir: Path) -> Iterator[None]:
     """A UserError in place of what a checkpoint of another structure raises."""
     try:
         yield
+    except UserError:
+        raise
     except (KeyError, TypeError, ValueError, RuntimeError, AttributeError, OverflowError) as error:
         raise UserError(f"the checkpoint of {run_dir} is damaged: {str(error).splitlines()[0]}") from error
 

@@ -17,6 +17,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, TypeVar
 
+import torch
+
 from pgkit import files
 from pgkit.cli import recipes
 from pgkit.errors import UserError
@@ -79,9 +81,8 @@ def read_json(path: Path) -> Any:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
         raise UserError(f"{path} cannot be read: {error}") from error
-    told = content.pop("sha256", None) if isinstance(content, dict) else None
-    if told is not None and told != _hash(content):
-        raise UserError(f"{path} is damaged, or was edited: its hash does not fit (an edited one has no sha256)")
+    if isinstance(content, dict) and {"sha256", "id"} & content.keys() and content.pop("sha256", "") != _hash(content):
+        raise UserError(f"{path} is damaged, or was edited: its hash does not fit")
     return content
 
 
@@ -138,7 +139,7 @@ def as_resumed(args: RunArgs, run_dir: Path) -> None:
     """Gives ``args`` the settings of the run that goes on, as the command line does; a warning names other values."""
     saved, free = saved_args(type(args), run_dir), {*free_on_resume(type(args)), "run_dir"}
     check_imports(saved, args.trust, *args.imports())
-    kept = {name: value for name, value in vars(saved).items() if name not in free and getattr(args, name) != value}
+    kept = {name: value for name, value in vars(saved).items() if name not in free and vars(args)[name] != value}
     if kept:
         names = ", ".join(f"{name}={value!r}" for name, value in sorted(kept.items()))
         logging.getLogger("pgkit").warning("the resumed run keeps its own settings: %s", names)
@@ -154,7 +155,7 @@ def versions() -> dict[str, str]:
             found[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
             continue
-    return found
+    return {**found, "torch": str(torch.__version__)}  # with its build (+cpu, +cu130), which a wheel may not name
 
 
 def git_revision() -> str | None:

@@ -81,7 +81,7 @@ def _can_start_over(path: Path, args: RunArgs, recipe: str) -> bool:
     if read_config(path).get("file") is None and read_config(path)["recipe"] != recipe:
         return False
     saved, free = saved_args(type(args), path), {*free_on_resume(type(args)), "run_dir"}
-    return all(value == getattr(args, name) for name, value in vars(saved).items() if name not in free)
+    return all(value == vars(args)[name] for name, value in vars(saved).items() if name not in free)
 
 
 def lock(path: Path) -> int | None:

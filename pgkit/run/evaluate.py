@@ -1,6 +1,6 @@
 """Evaluation: whole episodes, deterministic actions, the same number from every env slot."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from logging import getLogger
 from typing import Any
@@ -8,13 +8,15 @@ from typing import Any
 import numpy as np
 import torch
 from tensordict import TensorDict
-from torchrl.envs import TransformedEnv
+from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from pgkit.errors import UserError, check_whole_number
+from pgkit.collectors.actor import path_of, state_of
+from pgkit.envs import vector_of
+from pgkit.errors import check_whole_number
 from pgkit.run.seeding import preserved_rng
+from pgkit.seams import Entries, Key
 
-Entries = Mapping[str, torch.Tensor]
 LONG_EPISODE = 100_000  # steps; longer than those of Gymnasium, dm_control and Atari
 
 
@@ -33,85 +35,82 @@ def _evaluating(policy: torch.nn.Module) -> Iterator[None]:
 
 
 class Acting:
-    """A policy on plain arrays; a recurrent one remembers from call to call.
+    """A policy that acts, with its memory where it is recurrent.
 
     Args:
         policy: a TensorDict actor.
-        split: from observations ``[N, *obs]`` to the entries that it reads; by default all is ``observation``.
+        keys: of its actions.
     """
 
-    def __init__(self, policy: torch.nn.Module, split: Callable[[torch.Tensor], Entries] | None = None) -> None:
-        self.policy, self.split = policy, split or (lambda obs: {"observation": obs})
-        self.size = next((int(part.state_size) for part in policy.modules() if hasattr(part, "state_size")), 0)
-        self.state: torch.Tensor | None = None
+    def __init__(self, policy: torch.nn.Module, keys: tuple[Key, ...] = ("action",)) -> None:
+        self.policy, self.keys = policy, keys
+        self.memory = state_of(policy)
+        self.device = next((x.device for x in (*policy.parameters(), *policy.buffers())), None)
+        self.state: Tensor | None = None
 
-    def __call__(self, obs: np.ndarray, fresh: np.ndarray, deterministic: bool = True) -> np.ndarray:
-        """Actions ``[N, *action]`` for ``obs [N, *obs]``; ``fresh [N]``: an episode begins here."""
-        return self.on(self.split(torch.as_tensor(obs)), fresh, deterministic)
-
-    def on(self, entries: Entries, fresh: np.ndarray, deterministic: bool = True) -> np.ndarray:
-        """The same for entries as the policy reads them."""
-        device = next((p.device for p in self.policy.parameters()), torch.device("cpu"))
-        batch = TensorDict(dict(entries), [len(fresh)]).to(device)
-        if self.size:
-            batch["is_init"] = torch.as_tensor(fresh, device=device).unsqueeze(-1)
-            start = torch.zeros(len(fresh), self.size, device=device)
-            batch["recurrent_state"] = start if self.state is None else self.state
+    def __call__(self, entries: Mapping[Key, Tensor], begun: Tensor, deterministic: bool = True) -> Entries:
+        """Actions ``[N, ...]`` by key for the entries ``[N, ...]`` that it reads; ``begun [N]``: an episode begins."""
+        batch = TensorDict(dict(entries), [len(begun)]).to(self.device)
+        if self.memory is not None:
+            key, shape = self.memory
+            batch["is_init"] = begun.unsqueeze(-1).to(self.device)
+            start = torch.zeros(len(begun), *shape, device=self.device)
+            batch[key] = start if self.state is None else self.state
         kind = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
         with torch.no_grad(), set_exploration_type(kind):
             out = self.policy(batch)
-        self.state = out.get(("next", "recurrent_state"), None)
-        return out["action"].cpu().numpy()
+        self.state = None if self.memory is None else out[("next", *path_of(self.memory[0]))]
+        return {key: out[key] for key in self.keys}
 
 
 def act(policy: torch.nn.Module, obs: np.ndarray, deterministic: bool = True) -> np.ndarray:
     """Actions ``[N, *action]`` for the first observations of episodes, ``[N, *obs]``, without gradients."""
-    return Acting(policy)(obs, np.ones(len(obs), bool), deterministic)
-
-
-def check_playable(env: Any) -> None:
-    """A ``UserError`` for an environment that :func:`play` cannot step."""
-    if isinstance(env, TransformedEnv) or not hasattr(env, "arrays"):  # the former's arrays know no transforms
-        raise UserError(
-            f"evaluation plays what envs.make gives, a {type(env).__name__} is none of that: "
-            "use env.rollout(steps, actor)"
-        )
+    begun = torch.ones(len(obs), dtype=torch.bool)
+    return Acting(policy)({"observation": torch.as_tensor(obs)}, begun, deterministic)["action"].cpu().numpy()
 
 
 def play(policy: Any, env: Any, episodes: int, deterministic: bool = True) -> tuple[np.ndarray, np.ndarray]:
     """Returns and lengths of ``episodes`` whole episodes, each ``[episodes]``, ordered by env slot.
 
     Every one of the env's N slots plays its own share (``episodes / N``) to the end: to take whichever
-    episodes finish first would favour the short ones. The global random state and the policy's mode are kept.
+    episodes finish first would favour the short ones. The global random state and the policy's mode are kept. Of
+    several agents, the return is their mean.
 
     Args:
-        policy: a TensorDict actor that reads ``observation`` and writes ``action``, or what ``load_policy`` gives.
-        env: has ``.arrays``: ``reset()``, ``step(action)``, ``obs``, ``episode_reward``, ``step_count``.
+        policy: a TensorDict actor, or what ``load_policy`` gives.
+        env: from ``envs.make``, or any TorchRL environment that it takes.
         deterministic: the likeliest actions, or draws.
     """
     check_whole_number(1, episodes=episodes)
-    check_playable(env)
+    env = vector_of(env)
     policy = policy if isinstance(policy, torch.nn.Module) else policy.actor
-    arrays, act = env.arrays, Acting(policy, getattr(env, "split", None))
     with preserved_rng(), _evaluating(policy):
-        obs = arrays.reset()
-        slots = len(obs)
+        simulator, act = env.simulator, Acting(policy, tuple(env.action_keys))
+        fresh, slots = simulator.reset(), simulator.num_envs
         share = [episodes // slots + (slot < episodes % slots) for slot in range(slots)]
-        fresh = np.ones(slots, bool)
+        begun = torch.ones(slots, dtype=torch.bool, device=simulator.device)
         finished: list[list[tuple[float, int]]] = [[] for _ in range(slots)]
         while any(len(done) < wanted for done, wanted in zip(finished, share, strict=True)):
-            _, _, terminated, truncated = arrays.step(act(arrays.obs, fresh, deterministic))
-            fresh = terminated | truncated
-            if (arrays.step_count[~fresh] == LONG_EPISODE).any():
-                getLogger("pgkit").warning(
-                    "an episode of evaluation has come to %s steps and goes on: does the environment end? "
-                    "envs.make(id, max_episode_steps=...) sets a time limit", f"{LONG_EPISODE:,}",
-                )  # fmt: skip
-            for slot in np.flatnonzero(fresh):
-                if len(finished[slot]) < share[slot]:
-                    finished[slot].append((float(arrays.episode_reward[slot]), int(arrays.step_count[slot])))
+            actions = {key: x.to(simulator.device) for key, x in act(fresh, begun, deterministic).items()}
+            step = simulator.step(actions)
+            ended, begun, fresh = step.ended(), step.begun().clone(), step.fresh
+            _warn_of_length(simulator.step_count[~ended])
+            if ended.any():
+                totals = [x.flatten(1).double().mean(1) for x in simulator.episode_reward.values()]
+                returns = torch.stack(totals).mean(0)
+                for slot in ended.nonzero().flatten().tolist():
+                    if len(finished[slot]) < share[slot]:
+                        finished[slot].append((float(returns[slot]), int(simulator.step_count[slot])))
     flat = [episode for slot in finished for episode in slot]
     return np.array([reward for reward, _ in flat]), np.array([length for _, length in flat])
+
+
+def _warn_of_length(lengths: Tensor) -> None:
+    if (lengths == LONG_EPISODE).any():
+        getLogger("pgkit").warning(
+            "an episode of evaluation has come to %s steps and goes on: does the environment end? "
+            "envs.make(id, max_episode_steps=...) sets a time limit", f"{LONG_EPISODE:,}",
+        )  # fmt: skip
 
 
 def evaluate(policy: Any, env: Any, episodes: int, deterministic: bool = True) -> dict[str, float]:

@@ -17,6 +17,7 @@ from tensordict import TensorDictBase
 
 from pgkit import files
 from pgkit.errors import UserError
+from pgkit.run.board import Board
 
 _log = getLogger("pgkit")
 
@@ -32,8 +33,8 @@ def read_csv(path: Path) -> tuple[list[str], list[dict[str, str]]]:
             reader = csv.DictReader(file, strict=True)
             columns = list(reader.fieldnames or [])
             rows = [row for row in reader if None not in row and None not in row.values()]
-        for row in rows:
-            int(row["frames"]), [float(value) for value in row.values() if value]
+        for name in columns:
+            column(rows, name)  # numbers, all of them
     except (OSError, ValueError, KeyError, csv.Error) as error:
         raise UserError(f"{path} is damaged: {error}") from error
     return columns, rows
@@ -61,8 +62,6 @@ class Metrics:
     """
 
     def __init__(self, run_dir: Path, upto: int = 0, identity: str = "pgkit") -> None:
-        from torch.utils.tensorboard import SummaryWriter
-
         self.path = run_dir / "metrics.csv"
         self.columns: list[str] = []
         self._waiting: list[dict[str, str]] = []
@@ -70,8 +69,7 @@ class Metrics:
             self.columns, rows = read_csv(self.path)
             self._rewrite([row for row in rows if int(row["frames"]) <= upto])
         try:
-            purge = upto + 1 if upto else None
-            self._board: Any = SummaryWriter(str(run_dir), purge_step=purge, filename_suffix=f".{identity}")
+            self._board: Board | None = Board(run_dir, identity, upto)
         except OSError as error:
             files.cannot_write(run_dir, error)
 
@@ -83,9 +81,16 @@ class Metrics:
             self._append()
         except UserError as error:
             _log.warning("%s; the training goes on, and its rows wait", error)
-        for name, value in row.items():
-            if self._board and text[name] and name != "frames":
-                self._to_board(name, value, row["frames"])
+        if self._board is None:
+            return
+        try:
+            for name, value in row.items():
+                if text[name] and name != "frames":
+                    self._board.add(name, value, row["frames"])
+            self._board.flush()
+        except OSError as error:
+            self._board = None
+            _log.warning("TensorBoard's file cannot be written: %s; metrics.csv goes on", error.strerror)
 
     def _append(self) -> None:
         new = list(dict.fromkeys(name for row in self._waiting for name in row if name not in self.columns))
@@ -113,16 +118,9 @@ class Metrics:
         with files.replacing(self.path) as file:
             file.write(lines.getvalue().encode())
 
-    def _to_board(self, name: str, value: Any, frames: int) -> None:
-        try:
-            self._board.add_scalar(name, value, frames)
-        except OSError as error:
-            self._board = None
-            _log.warning("TensorBoard's file cannot be written: %s; metrics.csv goes on", error.strerror)
-
     def close(self) -> None:
         """Ends TensorBoard's file; a UserError if rows are still waiting that cannot be written."""
-        if self._board:
+        if self._board is not None:
             with contextlib.suppress(OSError):
                 self._board.close()
         if self._waiting:
@@ -131,6 +129,9 @@ class Metrics:
 
 def _text(value: float) -> str:
     return "" if math.isnan(value) else str(value)
+
+
+_NO_INFO = {"reward", "done", "terminated", "truncated", "episode_reward", "step_count", "is_init"}
 
 
 def finished_episodes(rollout: TensorDictBase | None) -> list[tuple[float, int]]:
@@ -143,6 +144,24 @@ def finished_episodes(rollout: TensorDictBase | None) -> list[tuple[float, int]]
     done = done.squeeze(-1).T
     rewards, lengths = (rollout["next", name].squeeze(-1).T[done] for name in ("episode_reward", "step_count"))
     return list(zip(rewards.tolist(), lengths.tolist(), strict=True))
+
+
+def finished_infos(rollout: TensorDictBase | None) -> dict[str, float]:
+    """Means over the episodes that end in a rollout of the single numbers that only ``next`` has: declared ``info``.
+
+    ``is_success`` is logged as ``rollout/success_rate``, any other under its own name.
+    """
+    if rollout is None or not (done := rollout["next", "done"]).any():
+        return {}
+    found = {}
+    for key in rollout["next"].keys(True, True):
+        path = (key,) if isinstance(key, str) else key
+        if path[-1] in _NO_INFO or key in rollout.keys(True, True) or rollout[("next", *path)].shape != done.shape:
+            continue
+        ends = rollout[("next", *path)][done].double()
+        if (ends := ends[~ends.isnan()]).numel():
+            found["rollout/" + ("success_rate" if path == ("is_success",) else "_".join(path))] = float(ends.mean())
+    return found
 
 
 def averages(rows: Sequence[Mapping[str, float]]) -> dict[str, float]:

@@ -73,7 +73,7 @@ def labels(configs: Mapping[Path, Mapping[str, Any]]) -> dict[Path, str]:
     names, recipes = {}, {run_dir: _recipe(config) for run_dir, config in configs.items()}
     for run_dir, config in configs.items():
         settings = config["settings"]
-        incidental = _WHICH_RUN.union(config.get("may_change", free_on_resume(RunArgs)))
+        incidental = _WHICH_RUN.union(map(str, config.get("may_change", free_on_resume(RunArgs))))
         peers = [
             other["settings"]
             for path, other in configs.items()

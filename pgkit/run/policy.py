@@ -1,7 +1,7 @@
 """A trained policy, loaded from a run directory, on plain NumPy."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -17,17 +17,17 @@ from pgkit.run.evaluate import Acting
 class Policy:
     """A policy with its observation normalizer, and the env it was trained for.
 
-    ``low`` and ``high`` are the action bounds ``[*action]``, None for discrete actions, which begin at ``start``.
-    ``observation_shape`` is a mapping from names to shapes where the policy reads the entries of a Dict.
+    ``to_env`` makes of the policy's actions what the environment takes, as in training; None leaves them.
+    ``observation_shape`` is a mapping from names to shapes where the policy reads the entries of a Dict;
+    ``observation_dtype`` names their types where they are not float32.
     """
 
     actor: torch.nn.Module
     make_env: Callable[..., Any]
     observation_shape: tuple[int, ...] | dict[str, tuple[int, ...]]
-    low: np.ndarray | None
-    high: np.ndarray | None
+    to_env: Callable[[np.ndarray], np.ndarray] | None = None
     frames: int = 0
-    start: Any = 0
+    observation_dtype: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._acting = Acting(self.actor)
@@ -40,8 +40,8 @@ class Policy:
     def predict(self, obs: Any, deterministic: bool = True) -> np.ndarray:
         """Action for one observation ``[*obs]``, or actions ``[N, *action]`` for a batch ``[N, *obs]``.
 
-        Where the policy reads the entries of a Dict, ``obs`` is a mapping from their names to arrays. Continuous
-        actions are clipped to the env's bounds. A wrong shape is a UserError.
+        Where the policy reads the entries of a Dict, ``obs`` is a mapping from their names to arrays. The actions are
+        what the environment takes: continuous ones are clipped to its bounds. A wrong shape is a UserError.
         """
         shapes = self.observation_shape
         shapes = shapes if isinstance(shapes, dict) else {"observation": shapes}
@@ -50,33 +50,29 @@ class Policy:
         for name, shape in shapes.items():
             if name not in given:
                 raise UserError(f"predict got {', '.join(given)}; the policy takes the entries {', '.join(shapes)}")
-            x = np.asarray(given[name], dtype=np.float32)
+            x = np.asarray(given[name], dtype=self.observation_dtype.get(name, "float32"))
             single = x.shape == shape
             if not single and x.shape[1:] != shape:
                 raise UserError(
                     f"predict got an {name} of shape {list(x.shape)}; the policy takes {list(shape)} or a batch"
                 )
             entries[name] = torch.from_numpy(x[None] if single else x)
-        fresh = np.full(len(next(iter(entries.values()))), self._begins)
-        action = self._acting.on(entries, fresh, deterministic)
+        begun = torch.full((len(next(iter(entries.values()))),), self._begins)
+        action = self._acting(entries, begun, deterministic)["action"].cpu().numpy()
         self._begins = False
-        if self.low is not None and self.high is not None:
-            action = np.clip(action, self.low, self.high)
-        elif np.any(self.start):
-            action = action + self.start
+        action = action if self.to_env is None else self.to_env(action)
         return action[0] if single else action
 
 
 def describe_env(env: Any) -> dict[str, Any]:
-    """What :class:`Policy` must know of an env: the observation's shape and the action's bounds."""
-    space, spec = env.action_spec_unbatched.space, env.observation_spec_unbatched
-    shapes = {name: tuple(spec[name].shape) for name in spec.keys()}
-    low, high = getattr(space, "low", None), getattr(space, "high", None)
+    """What :class:`Policy` must know of an env: the observation's shape and type, and how actions become its own."""
+    spec = env.observation_spec_unbatched
+    shapes = {name: tuple(spec[name].shape) for name in spec.keys(True, True)}
+    dtypes = {name: str(spec[name].dtype).removeprefix("torch.") for name in shapes}
     return {
         "observation_shape": shapes["observation"] if list(shapes) == ["observation"] else shapes,
-        "low": None if low is None else low.cpu().numpy(),
-        "high": None if high is None else high.cpu().numpy(),
-        "start": getattr(env, "action_start", 0),
+        "to_env": env.to_env,
+        "observation_dtype": {name: dtype for name, dtype in dtypes.items() if dtype != "float32"},
     }
 
 

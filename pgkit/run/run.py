@@ -20,13 +20,14 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
 from pgkit import files
+from pgkit.envs import vector_of
 from pgkit.errors import Diverged, UserError
 from pgkit.run import checkpoint, config, directory, ending, seeding
 from pgkit.run.agent import Agent
 from pgkit.run.args import RunArgs, check
 from pgkit.run.clock import Clock
-from pgkit.run.evaluate import check_playable, evaluate
-from pgkit.run.metrics import Metrics, averages, digest, finished_episodes
+from pgkit.run.evaluate import evaluate
+from pgkit.run.metrics import Metrics, averages, digest, finished_episodes, finished_infos
 from pgkit.run.plots import plot
 from pgkit.run.progress import Live
 from pgkit.seams import Stateful
@@ -203,6 +204,7 @@ class Run:
         self._seen = frames
         self._episodes.extend(finished_episodes(rollout))
         self._recent += [metrics] if metrics else []
+        self._recent += [infos] if (infos := finished_infos(rollout)) else []
         due = frames >= self.args.total_frames
         if self.args.eval_every:
             due |= frames // self.args.eval_every > self.frames // self.args.eval_every
@@ -261,7 +263,7 @@ class Run:
                         f"track(eval_env=...) is called as eval_env(num_envs=, seed=), this one cannot be ({error}): "
                         "functools.partial(envs.make, env_id)"
                     ) from error
-            check_playable(self._eval)
+            self._eval = vector_of(self._eval)
         return self._eval
 
     def _evaluate(self, row: Mapping[str, float]) -> dict[str, float]:

@@ -78,7 +78,7 @@ def parse(args_class: type[A], presets: Presets, argv: Sequence[str], variants: 
     args = _flags(args_class, dataclasses.replace(base, env_id=given.env_id or base.env_id), argv)
     args.env = {**base.env, **keywords}
     for title, chosen in ((f"variant {name}", variant), (f"preset {pattern}", preset)):
-        if shown := [f"{key}={value}" for key, value in chosen.items() if getattr(args, key) == value]:
+        if shown := [f"{key}={value}" for key, value in chosen.items() if vars(args)[key] == value]:
             print(f"{title}: {' '.join(shown)}")
     return args
 
@@ -181,14 +181,15 @@ def first_match(presets: Presets, env_id: str) -> tuple[str, Mapping[str, Any]]:
 
 def _check_resumed(saved: RunArgs, args: RunArgs) -> None:
     for name, why in {"env_id": "that run trains on", "run_dir": "a resumed run goes on in"}.items():
-        if getattr(args, name) != getattr(saved, name):
-            raise UserError(f"{flag(name, getattr(args, name))}: {why} {getattr(saved, name)}")
+        now, before = vars(args)[name], vars(saved)[name]
+        if now != before:
+            raise UserError(f"{flag(name, now)}: {why} {before}")
     free = free_on_resume(type(args))
     for field in dataclasses.fields(args):
-        name, mine, kept = field.name, getattr(args, field.name), getattr(saved, field.name)
+        name, mine, kept = field.name, vars(args)[field.name], vars(saved)[field.name]
         if name not in free and mine != kept:
             raise UserError(f"{flag(name, mine)}: a resumed run keeps its own, {kept}; another value needs a new run")
         if mine and (other := told(type(args), name).get("follows")):
-            now, before = getattr(args, other), getattr(saved, other)
+            now, before = vars(args)[other], vars(saved)[other]
             if now != before:
                 print(f"{flag(name)} ends at {now:,} frames, no longer at {before:,}: it jumps where the run goes on")

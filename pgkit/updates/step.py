@@ -155,7 +155,7 @@ def _sum(results: Iterable[Sequence[Tensor]], shares: Sequence[float]) -> list[T
 
 def other_rows(data: TensorDictBase, index: Tensor) -> Iterator[tuple[TensorDictBase, Tensor]]:
     """Other rows of the data, as many, on which a compiled step must repeat the step."""
-    for shift in range(1, 5):
+    for shift in range(1, 9):
         other = (index + shift * (len(index) + 1)) % (index.max() + 1)
         # data that is the batch may be used without the index: it gets other rows as well, some of them repeated
         rows = other // (1 + shift)

@@ -13,27 +13,21 @@ ROOT = Path(__file__).resolve().parents[2]
 RECIPE = '''"""Walks at random, with an env of its own."""
 
 from dataclasses import dataclass
+from functools import partial
 
+import gymnasium as gym
 import numpy as np
 import torch
 from tensordict.nn import TensorDictModule
-from torchrl.data import Bounded, Composite, Unbounded
 
-from pgkit import run
+from pgkit import envs, run
 
 
-class Env:
-    action_spec_unbatched = Bounded(-1.0, 1.0, (1,))
-    observation_spec_unbatched = Composite(observation=Unbounded((2,)))
+class Env(gym.Env):
+    observation_space, action_space = gym.spaces.Box(-1, 1, (2,)), gym.spaces.Box(-1, 1, (1,))
 
-    def __init__(self, num_envs, seed):
-        self.arrays, self.obs = self, np.zeros((num_envs, 2), np.float32)
-        self.episode_reward, self.step_count = np.full(num_envs, 7.0), np.ones(num_envs, int)
-
-    def set_seed(self, seed): ...
-    def close(self): ...
-    def reset(self): return self.obs
-    def step(self, action): return self.obs, None, np.ones(len(self.obs), bool), np.zeros(len(self.obs), bool)
+    def reset(self, *, seed=None, options=None): return np.zeros(2, np.float32), {}
+    def step(self, action): return np.zeros(2, np.float32), 7.0, True, False, {}
 
 
 @dataclass
@@ -42,7 +36,7 @@ class Args(run.RunArgs):
     """How wide."""
 
     def make_env(self, num_envs, seed, workers=1):
-        return Env(num_envs, seed)
+        return envs.make(Env, num_envs, seed=seed)
 
 
 class Net(torch.nn.Linear):
@@ -301,6 +295,7 @@ def test_an_error_in_pgkit_or_below_shows_every_frame(tmp_path: Path):
 def test_a_reader_that_goes_away_is_no_error(trained: Path):
     code = "from pgkit.cli.main import main; main(['ls'])"
     with subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as ls:
+        assert ls.stdout and ls.stderr
         ls.stdout.close()
         assert ls.stderr.read() == b""
     assert ls.returncode == 141

@@ -1,3 +1,5 @@
+from typing import Any
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -7,8 +9,8 @@ from torch import nn
 from torchrl.envs import GymEnv, RewardScaling, TransformedEnv
 from torchrl.modules import OrnsteinUhlenbeckProcessModule
 
-from pgkit import collectors, envs, modules
-from pgkit.collectors.policy import trace
+from pgkit import collectors, data, envs, modules
+from pgkit.collectors.policy import RowPolicy, function_of, trace
 from pgkit.errors import UserError
 
 
@@ -123,8 +125,8 @@ def test_resume_is_exact_for_any_number_of_workers(before, after):
 
 def test_traced_policy_is_the_actor_bit_for_bit():
     actor, collector = make()
-    obs = torch.from_numpy(collector.env.arrays.reset())
-    act = trace(actor, obs)
+    obs = collector.env.simulator.reset()["observation"]
+    act = trace(function_of(actor, ["observation"]), [obs], actor)
     torch.manual_seed(5)
     traced = act(obs)
     torch.manual_seed(5)
@@ -152,12 +154,21 @@ def test_frames_are_counted_and_bounded():
         collectors.VectorCollector(env, modules.gaussian_actor(env), frames_per_batch=50)
 
 
-@pytest.mark.parametrize("collector", [collectors.VectorCollector, collectors.AsyncCollector])
-def test_environments_of_torchrl_are_refused(collector):
-    env = envs.make("Pendulum-v1", num_envs=2)
-    scaled = TransformedEnv(env, RewardScaling(0, 1000))  # silently unscaled otherwise
-    with pytest.raises(UserError, match="a TransformedEnv is none of that: use collectors.TorchRLCollector"):
-        collector(scaled, modules.gaussian_actor(env), frames_per_batch=10)
+def test_environments_of_torchrl_are_stepped_with_their_transforms():
+    rollouts = []
+    for scale in (1.0, 10.0):
+        torch.manual_seed(0)
+        env = TransformedEnv(envs.make("Pendulum-v1", num_envs=2), RewardScaling(0, scale))
+        actor = modules.gaussian_actor(env)
+        rollouts.append(collectors.VectorCollector(env, actor, frames_per_batch=20, compile="off").rollout())
+    torch.testing.assert_close(rollouts[1]["next", "reward"], 10 * rollouts[0]["next", "reward"])
+    assert torch.equal(rollouts[1]["observation"], rollouts[0]["observation"])
+
+
+def test_an_environment_of_this_process_has_no_workers():
+    env = TransformedEnv(envs.make("Pendulum-v1", num_envs=2), RewardScaling(0, 10.0))
+    with pytest.raises(UserError, match="TransformedEnv given is in this process, .* give envs.make a function"):
+        collectors.AsyncCollector(env, modules.gaussian_actor(env), frames_per_batch=10)
 
 
 def test_an_actor_of_another_env():
@@ -173,7 +184,7 @@ def test_an_actor_of_another_env():
 def test_a_failing_worker_reports_its_traceback():
     env = envs.make("Pendulum-v1", num_envs=2, workers=2)
     collector = collectors.VectorCollector(env, modules.gaussian_actor(env), frames_per_batch=4)
-    env.make_env = lambda: 1 / 0
+    env.make = lambda first, count, seed: 1 / 0
     with pytest.raises(RuntimeError, match="collector worker 0 failed:(.|\n)*ZeroDivisionError"):
         collector.rollout()
 
@@ -333,3 +344,172 @@ def test_a_number_of_the_actor_that_changes_takes_effect(workers, caplog):
         assert torch.allclose(action, actor(rollout.clone())["action"], atol=1e-6) == exact
     assert torch.equal(second["observation"][:, 0], first["next", "observation"][:, -1])  # the episodes go on
     assert ("workers start again" in caplog.text) == (workers > 1)
+
+
+class Picture(gym.Env):
+    """An image that counts steps; ten steps an episode."""
+
+    observation_space, action_space = gym.spaces.Box(0, 255, (1, 12, 12), np.uint8), gym.spaces.Discrete(3)
+
+    def _observe(self):
+        return (np.arange(144, dtype=np.int64).reshape(1, 12, 12) * (3 + self.t) % 256).astype(np.uint8)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t = int(self.np_random.integers(5))
+        return self._observe(), {}
+
+    def step(self, action):
+        self.t += 1 + int(action)
+        return self._observe(), float(action), self.t > 10, False, {"picked": int(action)}
+
+
+class Scale(nn.Module):
+    def forward(self, x):
+        return x.float() / 255
+
+
+class Counted(nn.Module):
+    """Notices how many rows it is evaluated on."""
+
+    def __init__(self):
+        super().__init__()
+        self.register_buffer("rows", torch.zeros(()))
+
+    def forward(self, x):
+        self.rows.fill_(len(x))
+        return x
+
+
+def conv_agent(workers, num_envs=16, steps=10, compile="off"):
+    torch.manual_seed(0)
+    env = envs.make(Picture, num_envs=num_envs, seed=2, workers=workers, info=("picked",))
+    net = nn.Sequential(Counted(), Scale(), nn.Conv2d(1, 8, 3), nn.ReLU(), nn.Flatten(), nn.Linear(800, 32), nn.ReLU())
+    actor = modules.categorical_actor(env, encoder=net)
+    frames = num_envs * steps
+    return actor, collectors.VectorCollector(env, actor, frames_per_batch=frames, compile=compile)
+
+
+def test_workers_with_a_convolution_give_the_same_numbers_and_evaluate_their_own_rows_only():
+    rollouts = []
+    for workers in (1, 2, 4):
+        actor, collector = conv_agent(workers)
+        rollouts.append(torch.stack([collector.rollout(), collector.rollout()]))
+        pool: Any = collector._workers
+        held = actor if workers == 1 else pool._actor
+        counted = next(part for part in held.modules() if isinstance(part, Counted))
+        assert counted.rows == 16 // workers
+        collector.shutdown()
+    assert all(equal(rollouts[0], other) for other in rollouts[1:])
+    first = rollouts[0]
+    assert first["observation"].dtype == first["next", "observation"].dtype == torch.uint8
+    assert first["next", "picked"].dtype == torch.float32 and torch.equal(
+        first["next", "picked"][..., 0], first["action"].float()
+    )
+    assert first["action"].unique().tolist() == [0, 1, 2]
+
+
+def test_bytes_stay_bytes_in_the_replay():
+    _, collector = conv_agent(1)
+    replay = data.ReplayBuffer(collector.env, 200, seed=0)
+    rollout = collector.rollout()
+    replay.extend(rollout)
+    batch = replay.sample(8)
+    assert batch["observation"].dtype == batch["next", "observation"].dtype == torch.uint8
+    rows = rollout["observation"].flatten(0, 1)
+    assert all((rows == x).flatten(1).all(1).any() for x in batch["observation"])
+
+
+@pytest.mark.parametrize("num_envs", [2, 3, 6])
+def test_few_and_uneven_environments_give_the_same_numbers_too(num_envs):
+    rollouts = []
+    for workers in (1, 2, num_envs):
+        _, collector = make("HalfCheetah-v5", workers=workers, num_envs=num_envs, steps=10)
+        rollouts.append(collector.rollout())
+        collector.shutdown()
+    assert all(equal(rollouts[0], other) for other in rollouts[1:])
+
+
+def test_random_actions_do_not_depend_on_the_workers():
+    rollouts = []
+    for workers in (1, 3):
+        _, collector = make("HalfCheetah-v5", workers=workers, num_envs=6, init_random_frames=1)
+        rollouts.append(collector.rollout())
+        collector.shutdown()
+    actions = rollouts[0]["action"]
+    assert torch.equal(actions, rollouts[1]["action"]) and actions.abs().max() <= 1
+    assert actions.mean().abs() < 0.05 and abs(actions.var() - 1 / 3) < 0.02  # 1,800 draws, uniform
+    assert rollouts[0]["action_log_prob"].isnan().all()
+
+
+class Skewed(TensorDictModuleBase):
+    """Draws from a gamma distribution, by rejection."""
+
+    def __init__(self):
+        super().__init__()
+        self.in_keys, self.out_keys = ["observation"], ["action"]
+
+    def forward(self, tensordict):
+        shape = tensordict["observation"].abs() + 1
+        return tensordict.set("action", torch.distributions.Gamma(shape[..., :1], 1.0).sample())
+
+
+def test_a_policy_that_draws_by_rejection_repeats_itself_and_says_what_it_depends_on(caplog):
+    rollouts = []
+    with caplog.at_level("INFO", "pgkit"):
+        for _ in range(2):
+            env = envs.make("Pendulum-v1", num_envs=4, seed=1)
+            collector = collectors.VectorCollector(env, Skewed(), frames_per_batch=40, compile="off")
+            rollouts.append(torch.stack([collector.rollout(), collector.rollout()]))
+    assert equal(*rollouts) and "depend on the number of workers" in caplog.text
+    assert not torch.equal(rollouts[0]["action"][0], rollouts[0]["action"][1])
+
+
+@pytest.mark.parametrize("entry", ["observation", "reward"])
+def test_numbers_that_are_not_finite_are_named_before_the_rollout_is_handed_out(entry):
+    class Breaks(counted()):
+        def step(self, action):
+            obs, reward, *rest = super().step(action)
+            if self.t == 7:
+                obs, reward = (obs * np.nan, reward) if entry == "observation" else (obs, np.inf)
+            return obs, reward, *rest
+
+    env = envs.make(Breaks, num_envs=2)
+    collector = collectors.VectorCollector(env, modules.gaussian_actor(env), frames_per_batch=8, compile="off")
+    collector.rollout()
+    value = "nan" if entry == "observation" else "inf"
+    with pytest.raises(UserError, match=rf"'next.{entry}' of environment 0 is {value} at step 2 of the rollout"):
+        collector.rollout()
+
+
+def test_rows_whose_action_is_ignored_are_masked_and_no_frames():
+    env = envs.make(gym.make_vec("CartPole-v1", num_envs=4), seed=1)
+    actor = modules.categorical_actor(env)
+    collector = collectors.VectorCollector(env, actor, frames_per_batch=400, total_frames=600, compile="off")
+    rollout = next(iter(collector))
+    mask, done = rollout["collector", "mask"], rollout["next", "done"][..., 0]
+    assert mask.shape == (4, 100) and 380 <= mask.sum() < 400 and collector.frames == mask.sum()
+    assert torch.equal(~mask[:, 1:], done[:, :-1]) and mask[:, 0].all()
+    assert (rollout["next", "reward"][..., 0][~mask] == 0).all()
+    assert sum(1 for _ in collector) == 1
+    lengths = rollout["next", "step_count"][..., 0]
+    assert (lengths[~mask] == 0).all() and (lengths[mask] >= 1).all()
+
+
+def test_a_memory_begins_where_an_episode_does_after_a_masked_row():
+    env = envs.make(gym.make_vec("CartPole-v1", num_envs=2), seed=1)
+    actor = modules.categorical_actor(env, encoder=modules.gru(env, 4, (4,)))
+    rollout = collectors.VectorCollector(env, actor, frames_per_batch=200, compile="off").rollout()
+    begins = rollout["is_init"][..., 0]
+    assert begins[:, 0].all() and torch.equal(begins[:, 1:], ~rollout["collector", "mask"][:, :-1])
+
+
+def test_the_policy_s_noise_is_its_own_for_every_environment_and_step():
+    draws = []
+    for rows, first in ((8, 0), (3, 2)):
+        policy = RowPolicy(lambda x: (torch.randn_like(x),), [torch.zeros(rows, 5)], 8, first, 3, torch.nn.Identity())
+        for step in (0, 30):
+            with policy.steps(step, 40) as noise:
+                draws.append(torch.stack([policy([torch.zeros(rows, 5)], noise[t])[0].clone() for t in range(40)]))
+    assert torch.equal(draws[0][30:], draws[1][:10]) and torch.equal(draws[0][:, 2:5], draws[2][:, :3])
+    assert len(draws[0].unique()) == draws[0].numel() and abs(draws[0].std() - 1) < 0.1

@@ -6,7 +6,7 @@ from tensordict import TensorDict
 from torch import nn
 
 from pgkit import envs, modules
-from pgkit.collectors.policy import policy
+from pgkit.collectors.policy import function_of, native_policy
 from pgkit.compiled import choose, compiled, door, recorded, undone
 from pgkit.compiled.trial import check_repeats
 from pgkit.errors import UserError
@@ -231,7 +231,8 @@ def block_of(mode):
 def policy_of(mode):
     torch.manual_seed(0)
     env = envs.make("Pendulum-v1", 2)
-    native, obs = policy(modules.gaussian_actor(env), torch.ones(2, 3), mode)
+    actor, obs = modules.gaussian_actor(env), torch.ones(2, 3)
+    native = native_policy(function_of(actor, ["observation"]), [obs], actor, "record" if mode == "off" else mode)
     torch.manual_seed(1)
     return native, float(native.bind(None, obs)(obs)[0].sum())
 

@@ -57,6 +57,7 @@ def test_entries_apart_are_the_flat_ones(make):
 
 def test_shapes_and_types():
     td = envs.make(Sensors, num_envs=2, flatten=False).reset()
+    assert td["picture"].dtype == td["speed"].dtype == torch.float32
     assert torch.equal(td["picture"][1], torch.arange(16.0).view(1, 4, 4)) and td["speed"].shape == (2, 2)
     td = envs.make(Mixed, num_envs=2, flatten=False).reset()
     assert td["mode"].tolist() == [[0, 0, 1]] * 2 and td["level"].tolist() == [[0.5]] * 2

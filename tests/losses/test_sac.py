@@ -40,7 +40,8 @@ class Fixed(nn.Module):
         self.register_buffer("scale", torch.tensor([scale], dtype=torch.float64))
 
     def forward(self, observation):
-        return self.loc.expand(len(observation), 1), self.scale.expand(len(observation), 1)
+        shape = (*observation.shape[:-1], 1)
+        return self.loc.expand(shape), self.scale.expand(shape)
 
 
 class Twins(nn.Module):
@@ -251,8 +252,10 @@ def test_the_temperature_has_one_owner_and_torchrl_s_names():
     loss.log_alpha.data.fill_(5.0)
     assert loss.alpha.item() == pytest.approx(0.4)
     fixed = losses.SACLoss(actor, critics, alpha_init=0.3, fixed_alpha=True)
-    assert fixed.alpha.item() == 0.3 and fixed.alpha.dtype == torch.float64
+    assert fixed.alpha.item() == pytest.approx(0.3, abs=1e-15) and fixed.log_alpha is fixed.temperature.log_alpha
     assert not [name for name, _ in fixed.named_parameters() if "alpha" in name]
+    fixed.float().log_alpha.fill_(1.0)
+    assert fixed.alpha.item() == pytest.approx(math.e)
 
 
 @pytest.mark.parametrize("fixed", [False, True])
@@ -278,11 +281,12 @@ def test_a_coefficient_is_exact_in_a_float64_agent():
     rows = batch(8).double()
     rows["next", "done"], rows["next", "terminated"] = (rows["next", key].bool() for key in ("done", "terminated"))
     steps = torch.full((8, 1), 3)
-    zero = heads.Returns.certain(torch.ones(8, dtype=torch.float64))
-    target = loss.target(rows.set("steps_to_next_obs", steps), zero).mean
+    one = heads.Returns.certain(torch.ones(8, dtype=torch.float64))
+    target = loss.target(rows.set("steps_to_next_obs", steps), one).mean
     expected = rows["next", "reward"] + 0.97**3 * ~rows["next", "terminated"]
     torch.testing.assert_close(target, expected.squeeze(-1), rtol=0, atol=1e-15)
-    assert loss.target(rows.float(), heads.Returns.certain(torch.ones(8))).dtype == torch.float32
+    rows = batch(8).set("steps_to_next_obs", steps)
+    assert loss.target(rows, heads.Returns.certain(torch.ones(8))).dtype == torch.float32
 
 
 def test_augmented_copies_share_the_mean_of_their_targets_and_the_actor_takes_the_first():
@@ -297,6 +301,8 @@ def test_augmented_copies_share_the_mean_of_their_targets_and_the_actor_takes_th
     assert out["loss_qvalue"].item() == pytest.approx(19.5, abs=1e-4)
     assert out["loss_actor"].item() == pytest.approx(-2.0, abs=1e-5)
     torch.testing.assert_close(both["td_error"], torch.tensor([[1.5], [5.5]], dtype=torch.float64), atol=1e-4, rtol=0)
+    numbers = loss.target(both, torch.tensor([[4.0], [8.0]], dtype=torch.float64))  # a loss of one's own, without heads
+    assert numbers.tolist() == [[4.0], [4.0]]
     apart = by_hand(temperature=controllers.FixedTemperature(0.0))[0](both.clone())  # y = 3 and 5
     assert apart["loss_qvalue"].item() == pytest.approx((0.5 + 2.25 + 20.25) / 2, abs=1e-4)
 
@@ -307,7 +313,7 @@ def test_the_terms_of_a_composite_action_are_those_of_its_one_part():
     net = plain.actor_network[0]
     keys = [("params", "torque", "loc"), ("params", "torque", "scale")]
     net = TensorDictModule(net.module, net.in_keys, keys)
-    kwargs = {"distribution_map": {"torque": TanhNormal}, "distribution_kwargs": {"torque": {"low": -2.0, "high": 2.0}}}
+    kwargs = {"distribution_map": {"torque": TanhNormal}, "extra_kwargs": {"torque": {"low": -2.0, "high": 2.0}}}
     actor = ProbabilisticActor(
         net, in_keys=["params"], out_keys=["action"], distribution_class=CompositeDistribution,
         distribution_kwargs=kwargs, return_log_prob=True,

@@ -3,7 +3,7 @@
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
+from tensordict.nn import TensorDictModule, TensorDictParams
 from torch import nn
 from torchrl.objectives import LossModule, SoftUpdate
 
@@ -18,6 +18,10 @@ class Reconstruction(losses.Loss):
 
     encoder_network: nn.Module
     decoder_network: nn.Module
+    encoder_network_params: TensorDictParams
+    decoder_network_params: TensorDictParams
+    target_encoder_network_params: TensorDictParams
+    target_decoder_network_params: TensorDictParams
 
     def __init__(self, encoder, decoder):
         super().__init__()

@@ -94,7 +94,7 @@ def test_a_squashed_action_reaches_both_ends_of_its_range(tanh_loc):
     class Positive(gym.Env):
         observation_space, action_space = gym.spaces.Box(-1, 1, (3,)), gym.spaces.Box(0, 10, (1,))
 
-    env = envs.VectorEnv(Positive)
+    env = envs.make(Positive)
     actor = modules.tanh_normal_actor(env, tanh_loc=tanh_loc)
     bias, ends = actor.get_parameter("module.0.module.1.linear.bias"), []
     for loc in (-1e3, 0.0, 1e3):

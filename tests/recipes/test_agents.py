@@ -102,8 +102,8 @@ def test_a_trained_run_is_loaded_evaluated_and_begun_with(tmp_path: Path):
         assert torch.equal(mine, theirs)
     saved = files.load(tmp_path / "r" / "checkpoints" / "latest.pt")["states"]
     assert torch.equal(agent.loss.state_dict()["gamma"], saved["update"]["loss"]["gamma"])
-    tuned = ["--total-frames", 96, "--init", tmp_path / "r", "--run-dir", tmp_path / "tuned"]
-    pgkit("run", "td3", *flags, *small, *tuned)  # random frames only: nothing is trained
+    tuned = ["--total-frames", 112, "--updates-per-step", 0, "--init", tmp_path / "r", "--run-dir", tmp_path / "tuned"]
+    pgkit("run", "td3", *flags, *small, *tuned)  # nothing is trained
     for mine, theirs in zip(
         run.load_agent(tmp_path / "tuned").loss.state_dict().values(), agent.loss.state_dict().values(), strict=True
     ):

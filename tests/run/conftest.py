@@ -10,51 +10,65 @@ import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
-from torchrl.data import Bounded, Composite, Unbounded
+from torchrl.data import Bounded, Categorical, Composite, Unbounded
 
-from pgkit import run
+from pgkit import envs, run
 from pgkit.run import Agent, RunArgs
+from pgkit.seams import Step
 
 
-class CountingArrays:
-    """Slot ``i`` plays episodes of ``i + 1`` steps; a reward is ``seed + number of the episode``."""
-
-    def __init__(self, num_envs: int, seed: int):
-        self.num_envs, self.seed = num_envs, seed
-        self.actions: list[np.ndarray] = []
-        self.reset()
-
-    def reset(self) -> np.ndarray:
-        self.obs = np.zeros((self.num_envs, 2), np.float32)
-        self._reward, self._steps, self._episode = (np.zeros(self.num_envs) for _ in range(3))
-        self._fresh = np.ones(self.num_envs, bool)
-        return self.obs
-
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        self.actions.append(np.array(action))
-        self._reward[self._fresh] = self._steps[self._fresh] = 0
-        reward = (self.seed + self._episode).astype(np.float32)
-        self._reward += reward
-        self._steps += 1
-        done = self._steps == np.arange(self.num_envs) + 1
-        self._episode[done] += 1
-        self._fresh = done
-        self.episode_reward, self.step_count = self._reward.copy(), self._steps.astype(int)
-        return self.obs, reward, done, np.zeros_like(done)
+def clip(action: np.ndarray) -> np.ndarray:
+    return np.clip(action, -1.0, 1.0)
 
 
-class CountingEnv:
-    action_spec_unbatched = Bounded(-1.0, 1.0, torch.Size([1]))
-    observation_spec_unbatched = Composite(observation=Unbounded(torch.Size([2])))
+class CountingSimulator:
+    """Slot ``i`` plays episodes of ``i + 1`` steps; a reward is ``seed % 100 + number of the episode``."""
+
+    device, resume, masks = torch.device("cpu"), "exact", False
 
     def __init__(self, num_envs: int, seed: int):
         _ = torch.rand(1), np.random.rand()  # an env whose construction draws from the global generators
-        self.arrays = CountingArrays(num_envs, seed)
+        self.num_envs, self.seed = num_envs, seed
+        self.actions: list[torch.Tensor] = []
+        flag = Categorical(2, (num_envs, 1), dtype=torch.bool)
+        self.observation_spec = Composite(observation=Unbounded((num_envs, 2)), shape=(num_envs,))
+        self.action_spec = Composite(action=Bounded(-1.0, 1.0, (num_envs, 1)), shape=(num_envs,))
+        self.reward_spec = Composite(reward=Unbounded((num_envs, 1)), shape=(num_envs,))
+        self.done_spec = Composite(done=flag, terminated=flag, truncated=flag, shape=(num_envs,))
+        self.info_spec = Composite(shape=(num_envs,))
+        self.to_env = clip
+        self.reset()
 
-    def set_seed(self, seed: int) -> None:
-        self.arrays.seed = seed % 100
+    def reset(self, seed: int | None = None, rows: Any = None) -> dict[Any, torch.Tensor]:
+        self.seed = self.seed if seed is None else seed % 100
+        self._steps, self._episode = torch.zeros(2, self.num_envs, dtype=torch.int64)
+        self._reward, self._begun = torch.zeros(self.num_envs, 1), torch.ones(self.num_envs, dtype=torch.bool)
+        return {"observation": torch.zeros(self.num_envs, 2)}
+
+    def step(self, action: dict[Any, torch.Tensor]) -> Step:
+        self.actions.append(action["action"].clone())
+        self._reward[self._begun], self._steps[self._begun] = 0.0, 0
+        reward = (self.seed + self._episode).float().unsqueeze(-1)
+        self._reward += reward
+        self._steps += 1
+        done = (self._steps == torch.arange(self.num_envs) + 1).unsqueeze(-1)
+        self._begun = done.squeeze(-1)
+        self._episode += self._begun
+        self.episode_reward, self.step_count = {"reward": self._reward.clone()}, self._steps.clone()
+        obs = {"observation": torch.zeros(self.num_envs, 2)}
+        return Step(obs, {"reward": reward}, {"terminated": done}, {"truncated": done & False}, {}, obs)
+
+    def state_dict(self) -> dict[str, Any]:
+        return {}
+
+    def load_state_dict(self, state: dict[str, Any]) -> dict[Any, torch.Tensor]:
+        return self.reset()
 
     def close(self) -> None: ...
+
+
+def CountingEnv(num_envs: int, seed: int) -> envs.VectorEnv:
+    return envs.VectorEnv(lambda first, count, seed: CountingSimulator(count, seed), num_envs, seed)
 
 
 @dataclass
@@ -65,7 +79,7 @@ class CountingArgs(RunArgs):
         return CountingEnv(num_envs, seed)
 
 
-def agent(args: CountingArgs, env: CountingEnv) -> Agent:
+def agent(args: CountingArgs, env: envs.VectorEnv) -> Agent:
     """What :func:`train` trains."""
     return Agent(linear_policy(1.0))
 

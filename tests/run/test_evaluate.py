@@ -2,7 +2,6 @@ import random
 from types import SimpleNamespace
 
 import numpy as np
-import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import ProbabilisticTensorDictModule, TensorDictModule, TensorDictSequential
@@ -10,7 +9,6 @@ from torch.distributions import Normal
 from torchrl.envs import RewardScaling, TransformedEnv
 
 from pgkit import envs, modules, run
-from pgkit.errors import UserError
 
 
 class NoisyPolicy(torch.nn.Module):
@@ -64,13 +62,18 @@ def test_actions_are_deterministic(kit: SimpleNamespace):
     sample = ProbabilisticTensorDictModule(["loc", "scale"], ["action"], distribution_class=Normal)
     env = kit.Env(num_envs=2, seed=0)
     run.play(TensorDictSequential([net, sample]), env, episodes=2)
-    assert all((action == 0.25).all() for action in env.arrays.actions)
+    assert all((action == 0.25).all() for action in env.simulator.actions)
 
 
-def test_an_environment_with_transforms_is_not_played_without_them():
-    env = envs.make("Pendulum-v1", num_envs=2)
-    with pytest.raises(UserError, match="a TransformedEnv is none of that: use env.rollout"):
-        run.play(modules.gaussian_actor(env), TransformedEnv(env, RewardScaling(0, 1)), episodes=2)
+def test_an_environment_with_transforms_is_played_with_them():
+    env = envs.make("Pendulum-v1", num_envs=2, max_episode_steps=4)
+    actor = modules.gaussian_actor(env)
+    plain, lengths = run.play(actor, envs.make("Pendulum-v1", num_envs=2, seed=3, max_episode_steps=4), episodes=2)
+    inner = envs.make("Pendulum-v1", num_envs=2, max_episode_steps=4)
+    scaled = envs.make(TransformedEnv(inner, RewardScaling(0, 10.0)), seed=3)
+    returns, again = run.play(actor, scaled, episodes=2)
+    np.testing.assert_allclose(returns, 10 * plain, rtol=1e-6)
+    assert lengths.tolist() == again.tolist() == [4, 4]
 
 
 def test_draws_are_evaluated_on_request():
@@ -87,7 +90,7 @@ def test_draws_are_evaluated_on_request():
 def test_a_loaded_policy_is_evaluated_as_its_actor():
     env = envs.make("Pendulum-v1", 2, seed=1)
     actor = modules.gaussian_actor(env)
-    policy = run.Policy(actor, envs.make, (3,), None, None)
+    policy = run.Policy(actor, envs.make, (3,))
     env.set_seed(1)
     expected = run.evaluate(actor, env, 2)
     env.set_seed(1)

@@ -5,7 +5,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
-from pgkit.run.metrics import Metrics, averages, column, finished_episodes, read_csv
+from pgkit.run.metrics import Metrics, averages, column, finished_episodes, finished_infos, read_csv
 
 
 def write(run_dir: Path, *rows: dict[str, float], upto: int = 0) -> Path:
@@ -49,6 +49,15 @@ def test_tensorboard_gets_the_same_scalars(tmp_path: Path):
     assert [(event.step, event.value) for event in events.Scalars("train/x")] == [(10, 0.5), (20, 0.25)]
 
 
+def test_tensorboard_forgets_what_a_resume_drops(tmp_path: Path):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    write(tmp_path, {"frames": 10, "x": 1.0}, {"frames": 20, "x": 2.0}, {"frames": 30, "x": 3.0})
+    write(tmp_path, {"frames": 40, "x": 4.0}, upto=20)
+    events = EventAccumulator(str(tmp_path)).Reload()
+    assert [(event.step, event.value) for event in events.Scalars("x")] == [(10, 1.0), (20, 2.0), (40, 4.0)]
+
+
 def test_finished_episodes_are_those_where_done_oldest_first():
     done = torch.tensor([[0, 0, 1], [1, 0, 0]], dtype=torch.bool)  # env 1 ends at t = 0, env 0 at t = 2
     reward = torch.tensor([[1.0, 2.0, 3.0], [10.0, 1.0, 2.0]])
@@ -68,3 +77,14 @@ def test_a_line_that_was_cut_short_is_left_out(tmp_path: Path):
     path = tmp_path / "metrics.csv"
     path.write_text("frames,a,b\n10,1,2\n20,3,4\n3")
     assert [row["frames"] for row in read_csv(path)[1]] == ["10", "20"]
+
+
+def test_declared_infos_of_finished_episodes_are_logged_under_their_names():
+    done = torch.tensor([[[True], [False], [True]], [[False], [True], [False]]])
+    success = torch.tensor([[[1.0], [9.0], [0.0]], [[9.0], [1.0], [9.0]]])
+    length = torch.tensor([[[4.0], [9.0], [float("nan")]], [[9.0], [8.0], [9.0]]])
+    after = {"done": done, "is_success": success, "episode": {"l": length}, "observation": success, "reward": success}
+    rollout = TensorDict({"observation": success, "next": after}, [2, 3])
+    assert finished_infos(rollout) == {"rollout/success_rate": 2 / 3, "rollout/episode_l": 6.0}
+    assert finished_infos(TensorDict({"next": {"done": done & False, "is_success": success}}, [2, 3])) == {}
+    assert finished_infos(None) == {}

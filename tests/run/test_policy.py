@@ -44,7 +44,7 @@ def test_best_and_latest_are_different_weights(kit: SimpleNamespace, run_dir: Pa
 
 def test_the_entries_of_a_dict():
     actor = TensorDictModule(lambda a, b: a.sum(-1, keepdim=True) + b, ["a", "b"], ["action"])
-    policy = run.Policy(actor, lambda: None, {"a": (2,), "b": (1,)}, None, None)
+    policy = run.Policy(actor, lambda: None, {"a": (2,), "b": (1,)})
     np.testing.assert_array_equal(policy.predict({"a": np.array([1.0, 2.0]), "b": np.array([0.5])}), [3.5])
     np.testing.assert_array_equal(policy.predict({"a": np.ones((3, 2)), "b": np.ones((3, 1))}), [[3.0]] * 3)
     with pytest.raises(UserError, match="predict got a; the policy takes the entries a, b"):
@@ -66,3 +66,36 @@ def test_discrete_actions_begin_where_the_space_does():
     policy = run.Policy(modules.categorical_actor(env), lambda: None, **run.policy.describe_env(env))
     actions = policy.predict(np.random.default_rng(0).normal(size=(50, 2)) * 9)
     assert set(actions.tolist()) <= {5, 6, 7} and policy.predict(np.zeros(2)) in Late.action_space
+
+
+@pytest.mark.parametrize(
+    "space",
+    [
+        gym.spaces.Box(np.array([0.0, -np.inf], np.float32), np.array([np.inf, 1.0], np.float32)),
+        gym.spaces.Box(0, 5, (2,), np.int64),
+        gym.spaces.Box(-1, 1, (2,), np.float64),
+        gym.spaces.MultiBinary(2),
+    ],
+)
+def test_predict_gives_what_the_environment_gets_in_training(space: gym.Space):
+    class Keeps(gym.Env):
+        observation_space, action_space = gym.spaces.Box(-9, 9, (2,)), space
+
+        def reset(self, *, seed=None, options=None):
+            return np.ones(2, "f4"), {}
+
+        def step(self, action):
+            self.action = action
+            return np.ones(2, "f4"), 0.0, False, False, {}
+
+    env = envs.make(Keeps)
+    env.simulator.reset()
+    for value in (-9.3, 0.6, 9.7) if env.action_spec.dtype.is_floating_point else (0, 1):
+        raw = torch.full((1, 2), value)
+        actor = TensorDictModule(lambda obs, raw=raw: raw, ["observation"], ["action"])
+        policy = run.Policy(actor, lambda: None, **run.policy.describe_env(env))
+        predicted = policy.predict(np.ones(2))
+        env.simulator.step({"action": raw})
+        trained = env.simulator.envs[0].unwrapped.action
+        assert predicted.dtype == trained.dtype == space.dtype
+        assert predicted.tolist() == trained.tolist() and predicted in space

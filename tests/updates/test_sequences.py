@@ -108,18 +108,17 @@ def test_the_final_value_is_that_of_the_memory_after_the_last_step():
 def test_evaluation_and_prediction_remember_and_forget():
     actor, _, _ = make()
     env = envs.make("CartPole-v1", num_envs=2, seed=5)
-    obs = torch.from_numpy(env.arrays.reset().copy())
-    acting = Acting(actor)
-    fresh = torch.ones(2, dtype=torch.bool).numpy()
-    acting(obs.numpy(), fresh)
+    fresh, acting = env.simulator.reset(), Acting(actor)
+    obs, begun = fresh["observation"].clone(), torch.ones(2, dtype=torch.bool)
+    acting(fresh, begun)
     first = acting.state
-    acting(obs.numpy(), ~fresh)
+    acting(fresh, ~begun)
     assert not torch.equal(acting.state, first)
-    acting(obs.numpy(), fresh)
+    acting(fresh, begun)
     assert torch.equal(acting.state, first)
     assert run.play(actor, env, 4)[1].min() > 0
 
-    policy = run.Policy(actor, envs.make, (4,), None, None)
+    policy = run.Policy(actor, envs.make, (4,))
     policy.predict(obs.numpy())
     assert torch.equal(policy._acting.state, first)
     policy.predict(obs.numpy())

@@ -1,0 +1,169 @@
+"""Gymnasium environments stepped one by one: same-step autoreset, true final observations, exact replay."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import gymnasium as gym
+import numpy as np
+import torch
+from torch import Tensor
+from torchrl.data import Composite
+
+from pgkit.envs import spaces
+from pgkit.envs.checks import FLAGS, NUMBERS, check_step, checked_reset, misshapen
+from pgkit.envs.numpy_entries import Info, Infos, Observations, Totals, flags, rewards
+from pgkit.envs.seeding import episode_seed
+from pgkit.errors import UserError
+from pgkit.seams import Entries, Step
+
+WRONG = (ValueError, TypeError, KeyError)  # what writing an observation raises that is not of its space
+
+
+class Gymnasium:
+    """A :class:`~pgkit.seams.Simulator` of ``gym.Env`` objects in this process, on NumPy.
+
+    An episode that ends is reset within the same step. Every episode is seeded from ``(seed, index of the environment,
+    number of the episode)``, so the state of a deterministic simulator is those numbers and the actions since: that
+    is what :meth:`state_dict` stores and :meth:`load_state_dict` replays, bit for bit.
+
+    Args:
+        envs: the environments.
+        seed: the run's seed.
+        first: index of the first one, where this is a share of a larger vector.
+        flatten: False keeps the entries of a Dict observation apart.
+        info: entries of ``info`` that a step gives.
+    """
+
+    device = torch.device("cpu")
+    resume: Literal["exact", "new episodes"] = "exact"
+    masks = False
+
+    def __init__(
+        self, envs: Sequence[gym.Env], seed: int = 0, first: int = 0, flatten: bool = True, info: Info = ()
+    ) -> None:
+        if len({id(env.unwrapped) for env in envs}) < len(envs):
+            raise UserError("the function that makes an environment gave the same one twice: it must make a new one")
+        self.envs, self.num_envs, self.first = envs, len(envs), first
+        entries = spaces.observation_entries(envs[0].observation_space, flatten)
+        self.to_env = spaces.to_env(envs[0].action_space)
+        n = self.num_envs
+        self.observation_spec = Composite({entry.key: entry.spec(n) for entry in entries}, shape=(n,))
+        self.action_spec = Composite(action=spaces.action_spec(envs[0].action_space, n), shape=(n,))
+        self.reward_spec, self.done_spec = rewards(n), flags(n)
+        self._fresh, self._next, self._infos = Observations(entries, n), Observations(entries, n), Infos(info, n)
+        self.info_spec, self._totals = self._infos.spec, Totals(n)
+        self.episode_reward, self.step_count = self._totals.returns, self._totals.steps
+        self._result = Step(
+            self._next.tensors, self._totals.rewards, self._totals.ends, self._totals.cuts, self._infos.tensors,
+            self._fresh.tensors,
+        )  # fmt: skip
+        self._stepped = False
+        self._restart(seed)
+
+    def _restart(self, seed: int) -> None:
+        self.seed = seed
+        self._totals.forget(np.ones(self.num_envs, bool))
+        self._begun = np.zeros(self.num_envs, bool)  # the episode was begun and has not been stepped since
+        self._episode = np.full(self.num_envs, -1)
+        self._taken: list[np.ndarray] = []  # actions [N, ...] of the last steps
+        self._since = np.zeros(self.num_envs, np.int64)  # where in those each episode begins
+
+    def reset(self, seed: int | None = None, rows: Tensor | None = None) -> Entries:
+        """As :meth:`pgkit.seams.Simulator.reset`."""
+        if seed is not None:
+            self._restart(seed)
+        for i in range(self.num_envs) if rows is None else np.flatnonzero(rows.numpy()):
+            if not self._begun[i]:
+                self._begin(i)
+        return self._fresh.tensors
+
+    def _begin(self, i: int) -> None:
+        self._episode[i] += 1
+        seed = episode_seed(self.seed, self.first + i, int(self._episode[i]))
+        first_ones = self._episode[i] < 2  # whose resets are looked at closely
+        result = checked_reset(self.envs[i], seed) if first_ones else self.envs[i].reset(seed=seed)
+        self._write(i, result[0], "reset")
+        self._begun[i] = True
+        self._since[i] = len(self._taken)
+        oldest = int(self._since.min())
+        if 2 * oldest > len(self._taken):  # more than half belongs to episodes that are over
+            del self._taken[:oldest]
+            self._since -= oldest
+
+    def _write(self, i: int, obs: Any, method: str) -> None:
+        try:
+            self._fresh.write(i, obs)
+        except WRONG as error:
+            raise misshapen(self.envs[i], method, error) from error
+
+    def step(self, action: Entries) -> Step:
+        """As :meth:`pgkit.seams.Simulator.step`; Box actions are clipped to their bounds first."""
+        if self._begun.any():
+            self._totals.forget(self._begun)
+            self._begun[:] = False
+        totals, actions = self._totals, self.to_env(action["action"].numpy())
+        given = actions.copy()  # an environment may change its action in place, the history stays
+        reward, terminated, truncated, looks = totals.reward, totals.terminated, totals.truncated, not self._stepped
+        infos, write = self._infos if self._infos.tensors else None, self._next.write
+        if infos is not None:
+            infos.clear()
+        for i, env in enumerate(self.envs):
+            result = env.step(given[i])
+            if looks or len(result) != 5:
+                check_step(env, actions[i], result)
+            obs, gained, ended, cut, info = result
+            if type(gained) not in NUMBERS or type(ended) not in FLAGS or type(cut) not in FLAGS:
+                check_step(env, actions[i], result)
+            reward[i], terminated[i], truncated[i] = gained, ended, cut
+            try:
+                write(i, obs)
+            except WRONG as error:
+                raise misshapen(env, "step", error) from error
+            if infos is not None:
+                infos.write(i, info)
+        self._taken.append(actions)
+        self._stepped = True
+        totals.count()
+        self._fresh.copy_from(self._next)
+        done = totals.terminated | totals.truncated
+        if done.any():
+            for i in np.flatnonzero(done):
+                self._begin(i)
+        return self._result
+
+    def state_dict(self) -> dict[str, Any]:
+        """Of every environment the number of its episode and the actions since that began."""
+        rows = [
+            {"episode": int(episode), "actions": np.array([actions[i] for actions in self._taken[since:]])}
+            for i, (episode, since) in enumerate(zip(self._episode, self._since, strict=True))
+        ]
+        return {"seed": self.seed, "rows": rows}
+
+    def load_state_dict(self, state: dict[str, Any]) -> Entries:
+        """Restores every environment by replaying the actions of its current episode."""
+        self._restart(state["seed"])
+        history = [row["actions"] for row in state["rows"]]
+        for i, (env, row) in enumerate(zip(self.envs, state["rows"], strict=True)):
+            self._episode[i] = max(row["episode"], 0) - 1
+            self._begin(i)
+            for action in row["actions"]:
+                obs, reward, *_ = env.step(action.copy())
+                self._write(i, obs, "step")
+                self._totals.episode_reward[i] += np.float32(reward)
+                self._begun[i] = False
+            self._totals.step_count[i] = len(row["actions"])
+        longest = max(history, key=len)
+        taken = np.zeros((len(longest), self.num_envs, *longest.shape[1:]), longest.dtype)
+        self._since = np.array([len(longest) - len(actions) for actions in history])
+        for i, actions in enumerate(history):
+            if len(actions):
+                taken[self._since[i] :, i] = actions
+        self._taken = list(taken)
+        return self._fresh.tensors
+
+    def close(self) -> None:
+        """Closes every environment."""
+        for env in self.envs:
+            env.close()

@@ -1,0 +1,113 @@
+"""Gymnasium's and dm_control's environments by one scheme of ids."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import warnings
+from typing import Any
+
+import gymnasium as gym
+
+from pgkit.errors import UserError
+
+
+def make_one(env_id: str, **kwargs: Any) -> gym.Env:
+    """Makes one environment; ids and errors as in :func:`make`."""
+    if env_id.startswith("dmc:"):
+        env_id = f"dm_control/{env_id.removeprefix('dmc:')}-v0"
+    try:
+        if "mujoco" in _entry_point(env_id):
+            _hear_mujoco()
+        if env_id.startswith("dm_control/"):
+            return _make_dm_control(env_id, **kwargs)
+        spec = gym.registry.get(env_id)
+        known = env_id if spec is None else dataclasses.replace(spec, order_enforce=False)  # always reset before a step
+        return gym.make(known, disable_env_checker=True, **kwargs)
+    except gym.error.UnregisteredEnv as error:
+        if env_id.startswith("ALE/") and not any(known.startswith("ALE/") for known in gym.registry):
+            raise UserError(
+                f"environment '{env_id}' needs ale-py: pip install ale-py, then give its id as ale_py:{env_id}"
+            ) from error
+        raise _unknown(env_id, [known for known in gym.registry if not _successor(known)]) from error
+    except (gym.error.DependencyNotInstalled, ImportError) as error:
+        raise _not_installed(env_id, error) from error
+    except gym.error.Error as error:
+        raise UserError(f"environment '{env_id}': {str(error).splitlines()[0]}") from error
+    except TypeError as error:
+        if not kwargs or "argument" not in str(error):
+            raise
+        raise UserError(f"environment '{env_id}' cannot be made with these settings: {error}") from error
+
+
+def _not_installed(env_id: str, error: Exception) -> UserError:
+    module, colon, _ = env_id.partition(":")
+    cause = error.__cause__ or error
+    if colon and getattr(cause, "name", None) not in (None, module):
+        return UserError(f"environment '{env_id}': importing '{module}' failed ({cause})")
+    if colon:
+        return UserError(f"environment '{env_id}': no module '{module}' to import, neither here nor installed")
+    if newest := _successor(env_id):
+        return UserError(f"environment '{env_id}' is one of Gymnasium's former ones: use {newest}")
+    reason = str(error).splitlines()[0].rstrip(".")
+    return UserError(
+        f"environment '{env_id}' needs a package that is not installed ({reason}): pip install \"{_extra(env_id)}\""
+    )
+
+
+def _successor(env_id: str) -> str | None:
+    """The newest version of an environment, if MuJoCo's version 2 or 3 is asked for; those live in another package."""
+    name, _, version = env_id.rpartition("-v")
+    if version not in ("2", "3"):
+        return None
+    newest = max((spec.version or 0 for spec in gym.registry.values() if spec.name == name), default=0)
+    return f"{name}-v{newest}" if newest > 3 else None
+
+
+def _entry_point(env_id: str) -> str:
+    if env_id.startswith("dm_control/"):
+        return "dm_control.mujoco"
+    spec = gym.registry.get(env_id)
+    return str(spec.entry_point) if spec else ""
+
+
+def _hear_mujoco() -> None:
+    """MuJoCo's warnings become Python's, deprecations in Gymnasium's model files left out; no MUJOCO_LOG.TXT."""
+    import mujoco
+
+    def hear(message: bytes | str) -> None:
+        text = message.decode() if isinstance(message, bytes) else message
+        if "deprecated" not in text:
+            warnings.warn(f"MuJoCo: {text}", RuntimeWarning, stacklevel=2)
+
+    mujoco.set_mju_user_warning(hear)
+
+
+def _make_dm_control(env_id: str, **kwargs: Any) -> gym.Env:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # glfw says at import that there is no display
+        from dm_control import suite
+        from shimmy.dm_control_compatibility import DmControlCompatibilityV0
+    _hear_mujoco()  # again: dm_control has put its own hearer in place
+    domain, _, task = env_id.removeprefix("dm_control/").removesuffix("-v0").partition("-")
+    tasks = [(d, t) for d, t in suite.ALL_TASKS]
+    if (domain, task) not in tasks:
+        raise _unknown(env_id, [f"dm_control/{d}-{t}-v0" for d, t in tasks])
+    rendering = {key: kwargs.pop(key) for key in ("render_mode", "render_kwargs") if key in kwargs}
+    return DmControlCompatibilityV0(suite.load(domain, task, task_kwargs=kwargs or None), **rendering)
+
+
+def _unknown(env_id: str, known: list[str]) -> UserError:
+    nearest = difflib.get_close_matches(env_id, known, n=3, cutoff=0.4)
+    hint = f"; the nearest names are {', '.join(nearest)}" if nearest else "; see gymnasium.pprint_registry()"
+    return UserError(f"unknown environment id '{env_id}'{hint}; where a package registers it: PACKAGE:{env_id}")
+
+
+def _extra(env_id: str) -> str:
+    if env_id.startswith("dm_control/"):
+        return "shimmy[dm-control]"
+    entry = _entry_point(env_id)
+    for family in ("box2d", "mujoco", "toy_text", "classic_control"):
+        if family in entry:
+            return f"gymnasium[{family.replace('_', '-')}]"
+    return "gymnasium[all]"
