@@ -192,7 +192,7 @@ class LossView:
         Raises:
             UserError: the rollout is empty, or the block returns no TensorDict.
         """
-        if not rollout.numel():
+        if not rollout.batch_size.numel():  # numel() of a TensorDict is at least 1
             raise UserError(f"the rollout {shape_of(rollout)} is empty: collect at least one step of one environment")
         if block is not None:
             result: Any = block(rollout)

@@ -13,6 +13,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torch._ops import OpOverload
 from torch.fx import GraphModule, Node
+from torch.overrides import TorchFunctionMode
 
 from pgkit.compiled.captured import captured
 from pgkit.compiled.decisions import Decisions
@@ -66,7 +67,8 @@ class Recorder:
                     tensor.copy_(torch.where(as_recorded, tensor, value))
             return [as_recorded, *results]
 
-        graph = undone(held, lambda: record(flat, [*held, *leaves, *inputs]))
+        with _StaysInTorch():
+            graph = undone(held, lambda: record(flat, [*held, *leaves, *inputs]))
         _check_constants(graph, held)
         fixed = [tensor.detach() for tensor in held]
         code = self.compile(graph, [*fixed, *leaves, *inputs])
@@ -77,6 +79,15 @@ class Recorder:
             return results if not decisions else results[1:] if results[0] else None
 
         return run, decisions
+
+
+class _StaysInTorch(TorchFunctionMode):
+    """Refuses a tensor that becomes a NumPy array: what is computed from that would be a constant of the record."""
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if func in (Tensor.numpy, Tensor.__array__):
+            raise RuntimeError("it computes with NumPy, which no graph holds")
+        return func(*args, **(kwargs or {}))
 
 
 def recorded(

@@ -59,7 +59,7 @@ class Acting:
         kind = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
         with torch.no_grad(), set_exploration_type(kind):
             out = self.policy(batch)
-        self.state = None if self.memory is None else out[("next", *path_of(self.memory[0]))]
+        self.state = None if self.memory is None else out.get(("next", *path_of(self.memory[0])), None)
         return {key: out[key] for key in self.keys}
 
 

@@ -283,7 +283,7 @@ def test_a_coefficient_is_exact_in_a_float64_agent():
     steps = torch.full((8, 1), 3)
     one = heads.Returns.certain(torch.ones(8, dtype=torch.float64))
     target = loss.target(rows.set("steps_to_next_obs", steps), one).mean
-    expected = rows["next", "reward"] + 0.97**3 * ~rows["next", "terminated"]
+    expected = rows["next", "reward"] + 0.97**3 * (~rows["next", "terminated"]).double()
     torch.testing.assert_close(target, expected.squeeze(-1), rtol=0, atol=1e-15)
     rows = batch(8).set("steps_to_next_obs", steps)
     assert loss.target(rows, heads.Returns.certain(torch.ones(8))).dtype == torch.float32

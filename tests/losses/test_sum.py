@@ -182,6 +182,7 @@ def test_refusals():
 def test_it_is_a_loss_module():
     _, soft, aux = parts()
     both = losses.Sum(soft, aux)
+    SoftUpdate(both, tau=0.1)
     assert isinstance(both, LossModule)
     both.select_out_keys("loss_qvalue", "loss_reconstruction")
     assert set(both(batch()).keys()) == {"loss_qvalue", "loss_reconstruction"}

@@ -125,7 +125,8 @@ def test_accumulated_batches_are_one_larger_one(own):
         collector = collectors.VectorCollector(env, actor, frames_per_batch=64, compile="off")
         torch.manual_seed(1)
         metrics = [update(collector.rollout()) for _ in range(2)]
-        finals.append((weights(update), metrics[-1]))
+        means = {name: value for name, value in metrics[-1].items() if not name.endswith("_max")}  # of fewer rows
+        finals.append((weights(update), means))
     torch.testing.assert_close(finals[0][0], finals[1][0], rtol=1e-4, atol=1e-5)
     assert finals[0][1] == pytest.approx(finals[1][1], rel=1e-3)
 
