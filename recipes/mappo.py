@@ -79,19 +79,19 @@ VARIANTS = {"ippo": dict(critic="decentralized")}
 PRESETS = {
     "vmas/balance": dict(
         env={"n_agents": 4}, num_envs=600, steps=50, epochs=4, minibatch_size=3_000, learning_rate=1e-3,
-        hidden=(128, 128), eval_episodes=200,
+        hidden=(128, 128), eval_episodes=20,
     ),
     "mpe2/simple_speaker_listener_v4": dict(
         total_frames=2_000_000, num_envs=128, steps=25, minibatch_size=3_200, learning_rate=7e-4, entropy_coeff=0.01,
-        activation="relu", eval_episodes=100,
+        activation="relu", eval_episodes=50,
     ),
     "vmas/*": dict(
         num_envs=600, steps=50, epochs=4, minibatch_size=3_000, learning_rate=1e-3, hidden=(128, 128),
-        eval_episodes=200,
+        eval_episodes=20,
     ),
     "mpe2/*": dict(
         num_envs=128, steps=25, minibatch_size=3_200, learning_rate=7e-4, entropy_coeff=0.01, activation="relu",
-        eval_episodes=100,
+        eval_episodes=50,
     ),
 }  # fmt: skip
 

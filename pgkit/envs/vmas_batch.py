@@ -14,10 +14,18 @@ from torchrl.data import Composite
 
 from pgkit.envs.agents import Group, Names, groups_of, rewards, under
 from pgkit.envs.numpy_entries import flags
+from pgkit.envs.seeding import episode_seed
 from pgkit.envs.spaces import to_env
 from pgkit.envs.vmas_state import Slot, put, slots
 from pgkit.errors import UserError
 from pgkit.seams import Entries, Step
+
+
+ELSEWHERE = frozenset({
+    "joint_passage", "road_traffic", "simple_adversary", "simple_push", "simple_reference", "simple_speaker_listener",
+    "asym_joint", "circle_trajectory", "line_trajectory",
+})  # fmt: skip
+"""Scenarios that keep some of their state outside tensors ``[N, ...]``: a goal for the whole batch, a target object."""
 
 
 class Vmas:
@@ -26,6 +34,9 @@ class Vmas:
     Environments that end begin anew together: all are reset, and those that go on get their state back. All of VMAS's
     environments share one stream of random numbers; each of these has its own, so that an evaluation changes nothing.
     VMAS's ``max_steps`` would terminate; here a time limit truncates.
+
+    Scenarios of a user's own, and those in ``ELSEWHERE``, are reset one environment after the other, and a resume
+    begins new episodes.
 
     Args:
         scenario: a name, or a ``vmas.simulator.scenario.BaseScenario``.
@@ -40,7 +51,6 @@ class Vmas:
         UserError: VMAS is not installed, there is no such scenario, or the spaces do not fit.
     """
 
-    resume: Literal["exact", "new episodes"] = "exact"
     masks = False
 
     def __init__(
@@ -56,6 +66,9 @@ class Vmas:
         if "max_steps" in kwargs:
             raise UserError("max_steps= would end episodes as if they had failed: max_episode_steps= cuts them off")
         self.num_envs, self.device, self.limit = num_envs, torch.device(device or "cpu"), max_episode_steps
+        known = isinstance(scenario, str) and scenario not in ELSEWHERE
+        self.resume: Literal["exact", "new episodes"] = "exact" if known else "new episodes"
+        self._steps = 0
         self._make = {"scenario": scenario, "num_envs": num_envs, "device": self.device, **kwargs}
         self._restart(seed)
         names = [agent.name for agent in self.env.agents]
@@ -120,9 +133,13 @@ class Vmas:
 
     def _begin(self, rows: Tensor) -> Entries:
         """New episodes in these rows; what the policy reads next, everywhere."""
-        before = {} if rows.all() else {path: x.clone() for path, _, _, x in self._batched()}
+        together = bool(rows.all()) or self.resume == "exact"
+        before = {} if rows.all() or not together else {path: x.clone() for path, _, _, x in self._batched()}
         with self._stream:
-            self.env.reset(return_observations=False)
+            if together:
+                self.env.reset(return_observations=False)
+            for i in [] if together else rows.nonzero().flatten().tolist():
+                self.env.reset_at(i, return_observations=False)
         for slot in self._batched() if before else []:
             path, _, _, fresh = slot
             if path in before:
@@ -147,6 +164,7 @@ class Vmas:
                 actions[i] = agent.clone()
         with self._stream:
             observed, rewarded, terminated, _ = self.env.step(actions)
+        self._steps += 1
         reward = self._grouped([x.view(-1, 1) for x in rewarded], "reward")
         goes_on = ~self._begun
         self.step_count = self.step_count * goes_on + 1
@@ -161,11 +179,13 @@ class Vmas:
         return Step(after, reward, *ends, {}, self._fresh)
 
     def state_dict(self) -> dict[str, Any]:
-        """Every number and tensor that VMAS's objects hold, and the state of the random numbers."""
+        """Every number and tensor that VMAS's objects hold, and the state of the random numbers, where that is all."""
+        state = {"seed": self.seed, "steps": self._steps}
+        if self.resume == "new episodes":
+            return state
         held = {path: x.clone() if isinstance(x, Tensor) else x for path, _, _, x in slots(self.env)}
         counts = {"step_count": self.step_count, "begun": self._begun}
-        return {
-            "seed": self.seed,
+        return state | {
             "held": held,
             "random": list(self._stream.state),
             "counts": {name: x.clone() for name, x in counts.items()},
@@ -174,8 +194,14 @@ class Vmas:
 
     @torch.no_grad()
     def load_state_dict(self, state: dict[str, Any]) -> Entries:
-        """Goes on exactly."""
-        self._restart(state["seed"])
+        """Goes on exactly, or begins new episodes with a seed of their own."""
+        begins = self.resume == "new episodes" and state["steps"]
+        self._restart(episode_seed(state["seed"], 0, state["steps"]) if begins else state["seed"])
+        self.seed = state["seed"]
+        if self.resume == "new episodes":
+            self._begin_counts()
+            self._steps = state["steps"]
+            return self._fresh
         zeros = {(g.name, "action"): self.action_spec[g.name, "action"].zero() for g in self.groups}
         self._begin_counts()
         self.step(zeros)  # makes what VMAS makes at the first step
@@ -183,6 +209,7 @@ class Vmas:
             if slot[0] in state["held"]:
                 put(slot, state["held"][slot[0]])
         self._stream.state[:] = state["random"]
+        self._steps = state["steps"]
         self.step_count, self._begun = (state["counts"][name].to(self.device) for name in ("step_count", "begun"))
         self.episode_reward = dict(zip(self.episode_reward, state["returns"], strict=True))
         self._fresh = self._grouped(self._observed(), "observation")
