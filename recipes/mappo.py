@@ -28,7 +28,7 @@ class Args(run.RunArgs):
     eval_every: int = 100_000
     """Evaluate and save a checkpoint every so many frames; 0 = only at the end."""
     critic: Literal["centralized", "decentralized"] = "centralized"
-    """The critic reads all observations of a group and its own kind (MAPPO), or each agent's own (IPPO)."""
+    """The critic reads the observations of all agents of its group (MAPPO), or each agent's own (IPPO)."""
     share_parameters: bool = True
     """One set of parameters for all agents of a group, or one for each."""
     agent_ids: bool = False
@@ -72,6 +72,8 @@ class Args(run.RunArgs):
     """Activation of the hidden layers."""
     log_std: float = -0.5
     """Initial log standard deviation of a continuous policy."""
+    variant: str = ""
+    """Start from the settings of ippo."""
 
 
 VARIANTS = {"ippo": dict(critic="decentralized")}
@@ -155,7 +157,7 @@ def agent(args: Args, env: envs.VectorEnv) -> run.Agent:
 
 def main(args: Args) -> None:
     """Trains, logs, evaluates, saves."""
-    with run.Run(args, recipe="mappo") as log:
+    with run.Run(args, recipe=args.variant or "mappo") as log:
         env = args.make_env(args.num_envs, args.seed, args.workers)
         with run.placed(args):
             built = agent(args, env)

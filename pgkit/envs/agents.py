@@ -87,7 +87,9 @@ def _check(kind: str, agents: Sequence[str], wanted: Names) -> None:
     if unknown := [x for x in grouped if x not in agents]:
         raise UserError(f"groups=: {kind} has no agent '{unknown[0]}', only {', '.join(agents)}")
     if wrong := [x for x in agents if grouped.count(x) != 1]:
-        raise UserError(f"groups=: agent '{wrong[0]}' of {kind} is in {grouped.count(wrong[0])} groups: put it into one")
+        raise UserError(
+            f"groups=: agent '{wrong[0]}' of {kind} is in {grouped.count(wrong[0])} groups: put it into one"
+        )
 
 
 def _group(

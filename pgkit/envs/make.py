@@ -198,7 +198,9 @@ def _only_for_single(settings: Settings, env: Any) -> None:
         "info=": bool(settings.info), "flatten=False": not settings.flatten,
     }  # fmt: skip
     if named := [name for name, is_given in given.items() if is_given]:
-        raise UserError(f"{named[0]} is for single Gymnasium environments, this is a {type(env).__name__}: leave it out")
+        raise UserError(
+            f"{named[0]} is for single Gymnasium environments, this is a {type(env).__name__}: leave it out"
+        )
 
 
 def _simulator(env: EnvBase | GymVectorEnv, seed: int, first: int, settings: Settings) -> Simulator:

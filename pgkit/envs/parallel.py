@@ -54,9 +54,7 @@ class Parallel:
     resume: Literal["exact", "new episodes"] = "exact"
     masks = False
 
-    def __init__(
-        self, envs: Sequence[ParallelEnv], seed: int = 0, first: int = 0, groups: Names | None = None
-    ) -> None:
+    def __init__(self, envs: Sequence[ParallelEnv], seed: int = 0, first: int = 0, groups: Names | None = None) -> None:
         if len({id(env) for env in envs}) < len(envs):
             raise UserError("the function that makes an environment gave the same one twice: it must make a new one")
         self.envs: Sequence[Any] = envs

@@ -20,7 +20,6 @@ from pgkit.envs.vmas_state import Slot, put, slots
 from pgkit.errors import UserError
 from pgkit.seams import Entries, Step
 
-
 ELSEWHERE = frozenset({
     "joint_passage", "road_traffic", "simple_adversary", "simple_push", "simple_reference", "simple_speaker_listener",
     "asym_joint", "circle_trajectory", "line_trajectory",
@@ -240,7 +239,7 @@ def _vmas(scenario: Any) -> tuple[Any, _Stream]:
         import vmas
         from vmas.simulator.environment import Environment
     except ImportError as error:
-        raise UserError(f"vmas/{scenario} needs VMAS ({error}): pip install \"pgkit[agents]\"") from error
+        raise UserError(f'vmas/{scenario} needs VMAS ({error}): pip install "pgkit[agents]"') from error
     known = [*vmas.scenarios, *vmas.debug_scenarios, *vmas.mpe_scenarios]
     if isinstance(scenario, str) and scenario not in known:
         nearest = ", ".join(f"vmas/{x}" for x in difflib.get_close_matches(scenario, known, cutoff=0.4) or known)

@@ -85,7 +85,9 @@ def test_an_agent_that_dies_is_masked_and_the_episode_goes_on():
     for _ in range(5):
         step = simulator.step({("agents", "action"): action})
         masks.append(step.next["agents", "mask"][0].tolist())
-        dead.append([step.terminated["terminated"][0].item(), *step.terminated["agents", "terminated"][0, :, 0].tolist()])
+        dead.append(
+            [step.terminated["terminated"][0].item(), *step.terminated["agents", "terminated"][0, :, 0].tolist()]
+        )
         cut.append([step.truncated["truncated"][0].item(), *step.truncated["agents", "truncated"][0, :, 0].tolist()])
         rewards.append(step.reward["agents", "reward"][0, :, 0].tolist())
         lengths.append(int(simulator.step_count[0]))
@@ -244,7 +246,11 @@ class Mixed(Unlike):
         ("CartPole-v1", {"groups": {"a": ["b"]}}, "groups= is for environments with many agents"),
         ("vmas/balanse", {}, "unknown environment id 'vmas/balanse'; the nearest names are vmas/balance"),
         ("vmas/balance", {"max_steps": 5}, "max_episode_steps= cuts them off"),
-        ("mpe2/simple_spread", {}, "unknown environment id 'mpe2/simple_spread'; the nearest names are mpe2/simple_spr"),
+        (
+            "mpe2/simple_spread",
+            {},
+            "unknown environment id 'mpe2/simple_spread'; the nearest names are mpe2/simple_spr",
+        ),
     ],
 )
 def test_mistakes_are_one_line(make: Any, settings: dict[str, Any], message: str):
