@@ -121,8 +121,8 @@ def _team(who: Agents, centralized: Centralized) -> tuple[list[nn.Module], list[
         raise UserError("centralized= is for a group of agents, the environment has one agent")
     if not isinstance(centralized, bool | str) and centralized[0] == who.name:
         raise UserError(
-            f"centralized={centralized}: that is each agent's own, in the group '{who.name}': centralized=True reads all "
-            "agents' observations, a key at the root names a state that they share"
+            f"centralized={centralized}: that is each agent's own, in the group '{who.name}': centralized=True reads "
+            "all agents' observations, a key at the root names a state that they share"
         )
     ids: list[nn.Module] = [AgentIds(who.number)] if who.ids else []
     if centralized is False:

@@ -144,9 +144,7 @@ def finished_episodes(rollout: TensorDictBase | None) -> list[tuple[float, int]]
     if rollout is None or not (done := rollout["next", "done"]).any():
         return []
     following = rollout["next"]
-    totals = [
-        key for key in following.keys(True, True) if (key if isinstance(key, str) else key[-1]) == "episode_reward"
-    ]
+    totals = [key for key in following.keys(True, True) if "episode_reward" in (key, key[-1])]
     if not totals:
         return []
     done = done.squeeze(-1).T

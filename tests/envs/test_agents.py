@@ -18,7 +18,7 @@ from tests.collectors.test_vector import equal
 
 
 class Fading(ParallelEnv):
-    """The first agent dies after 2 steps, the other is cut off after 4; each observes (step, its number), earns its action."""
+    """The first agent dies after 2 steps, the other is cut off after 4; each observes (step, its number)."""
 
     metadata = {"name": "fading"}
     possible_agents = ["walker_0", "walker_1"]
@@ -85,10 +85,8 @@ def test_an_agent_that_dies_is_masked_and_the_episode_goes_on():
     for _ in range(5):
         step = simulator.step({("agents", "action"): action})
         masks.append(step.next["agents", "mask"][0].tolist())
-        dead.append(
-            [step.terminated["terminated"][0].item(), *step.terminated["agents", "terminated"][0, :, 0].tolist()]
-        )
-        cut.append([step.truncated["truncated"][0].item(), *step.truncated["agents", "truncated"][0, :, 0].tolist()])
+        dead.append([x[0].flatten().tolist() for x in step.terminated.values()])
+        cut.append([x[0].flatten().tolist() for x in step.truncated.values()])
         rewards.append(step.reward["agents", "reward"][0, :, 0].tolist())
         lengths.append(int(simulator.step_count[0]))
         if len(masks) == 4:
@@ -97,8 +95,8 @@ def test_an_agent_that_dies_is_masked_and_the_episode_goes_on():
             assert step.fresh["agents", "observation"][0, 1, 0] < 1
     T, F = True, False
     assert masks == [[T, T], [F, T], [F, T], [F, F], [T, T]]
-    assert dead == [[F, F, F], [F, T, F], [F, T, F], [F, T, F], [F, F, F]]
-    assert cut == [[F, F, F], [F, F, F], [F, F, F], [T, F, T], [F, F, F]]
+    assert dead == [[[F], [F, F]], [[F], [T, F]], [[F], [T, F]], [[F], [T, F]], [[F], [F, F]]]
+    assert cut == [[[F], [F, F]], [[F], [F, F]], [[F], [F, F]], [[T], [F, T]], [[F], [F, F]]]
     assert rewards == [[0.5, -1.0], [0.5, -1.0], [0.0, -1.0], [0.0, -1.0], [0.5, -1.0]]  # clipped to -1
     assert lengths == [1, 2, 3, 4, 1] and totals == [[1.0, -4.0], [0.5, 4.0]]
 

@@ -53,9 +53,9 @@ def solo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
 
 
 PLAIN = (
-    "--total-frames", 1600, "--num-envs", 4, "--steps", 100, "--epochs", 2, "--minibatch-size", 100, "--eval-every", 800,
-    "--eval-episodes", 2, "--hidden", 8, 8, "--compile", "off", "--max-grad-norm", 0.5, "--critic-coeff", 0.5,
-    "--learning-rate", 1e-3, "--gamma", 0.95,
+    "--total-frames", 1600, "--num-envs", 4, "--steps", 100, "--epochs", 2, "--minibatch-size", 100,
+    "--eval-every", 800, "--eval-episodes", 2, "--hidden", 8, 8, "--compile", "off",
+    "--max-grad-norm", 0.5, "--critic-coeff", 0.5, "--learning-rate", 1e-3, "--gamma", 0.95,
 )  # fmt: skip
 
 
