@@ -104,9 +104,10 @@ def _group(
                 f"group '{name}': {first} and {other[0]} {what} different spaces ({found[first]}, {found[other[0]]}), "
                 f"one network needs equal ones: give them groups of their own, groups={{...}}, or pad them in a wrapper"
             )
-    space = observations[first]
-    masked = isinstance(space, spaces.Dict) and set(space.spaces) == {"observation", "action_mask"}
-    (entry,) = observation_entries(space["observation"] if masked else space)
+    space, masked = observations[first], False
+    if isinstance(space, spaces.Dict) and set(space.spaces) == {"observation", "action_mask"}:
+        space, masked = space["observation"], True
+    (entry,) = observation_entries(space)
     return Group(name, tuple(members), entry, actions[first], masked)
 
 

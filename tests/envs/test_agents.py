@@ -180,7 +180,8 @@ def test_vmas_is_cut_off_by_its_time_limit_and_its_agents_are_one_group():
 
 def test_another_vmas_environment_changes_nothing_and_torchs_generator_stays():
     alone, beside = balance(), balance()
-    alone.simulator.reset(), beside.simulator.reset()
+    for env in (alone, beside):
+        env.simulator.reset()
     state = torch.get_rng_state()
     expected = steps(alone.simulator, 15)
     found = []
@@ -198,7 +199,8 @@ def test_another_vmas_environment_changes_nothing_and_torchs_generator_stays():
 @pytest.mark.parametrize(("name", "exact"), [("balance", True), ("navigation", True), ("joint_passage", False)])
 def test_vmas_resumes_exactly_where_its_state_is_in_tensors(name: str, exact: bool):
     one, other = balance(name=name).simulator, balance(seed=3, name=name).simulator
-    one.reset(), other.reset()
+    for simulator in (one, other):
+        simulator.reset()
     steps(one, 8)
     state = one.state_dict()
     other.load_state_dict(state)
