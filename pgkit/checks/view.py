@@ -101,7 +101,8 @@ class LossView:
     def masks(self) -> list[Any]:
         """Where a mask of the rows that count may lie: TorchRL's, the loss's own, or a group's."""
         own = self.loss.loss_mask_key if isinstance(self.loss, LossModule) else None
-        groups = [group(key) for key in (*self.keys("action"), *self.keys("advantage")) if group(key)]
+        read = (*self.keys("action"), *self.keys("advantage"), *self.in_keys)  # the last: of a sum of several groups'
+        groups = [group(key) for key in read if group(key)]
         named = [] if own in (None, "auto") else [own]
         return [("collector", "mask"), "shifted_valid", *named, *dict.fromkeys((*path, "mask") for path in groups)]
 

@@ -66,7 +66,8 @@ def _allowed(spec: TensorSpec, mask: Tensor) -> Tensor:
     parts = []
     for part in choices(spec, mask):
         possible = part | ~part.any(-1, keepdim=True)  # rows of padding allow nothing, and are thrown away
-        parts.append(torch.multinomial(possible.float(), 1))
+        drawn = torch.multinomial(possible.flatten(0, -2).float(), 1)
+        parts.append(drawn.view(*possible.shape[:-1], 1))
     return torch.cat(parts, -1) if isinstance(spec, MultiCategorical) else parts[0].squeeze(-1)
 
 

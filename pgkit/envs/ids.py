@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import importlib
+import pkgutil
 import warnings
 from typing import Any
 
@@ -12,11 +14,16 @@ import gymnasium as gym
 from pgkit.errors import UserError
 
 
-def make_one(env_id: str, **kwargs: Any) -> gym.Env:
-    """Makes one environment; ids and errors as in :func:`make`."""
+def make_one(env_id: str, **kwargs: Any) -> Any:
+    """Makes one environment, a ``gym.Env`` or PettingZoo's; ids and errors as in :func:`make`."""
     if env_id.startswith("dmc:"):
         env_id = f"dm_control/{env_id.removeprefix('dmc:')}-v0"
+    module, colon, name = env_id.partition(":")
     try:
+        if env_id.startswith("mpe2/"):
+            return _make_mpe2(env_id, **kwargs)
+        if colon and name.isidentifier() and name in (found := vars(importlib.import_module(module))):
+            return found[name](**kwargs)
         if "mujoco" in _entry_point(env_id):
             _hear_mujoco()
         if env_id.startswith("dm_control/"):
@@ -38,6 +45,18 @@ def make_one(env_id: str, **kwargs: Any) -> gym.Env:
         if not kwargs or "argument" not in str(error):
             raise
         raise UserError(f"environment '{env_id}' cannot be made with these settings: {error}") from error
+
+
+def _make_mpe2(env_id: str, max_episode_steps: int | None = None, **kwargs: Any) -> Any:
+    """One of mpe2's, which registers no ids: each is a module with a function ``parallel_env``."""
+    import mpe2
+
+    name, known = env_id.removeprefix("mpe2/"), [x.name for x in pkgutil.iter_modules(mpe2.__path__)]
+    known = [x for x in known if x.rpartition("_v")[2].isdigit()]
+    if name not in known:
+        raise _unknown(env_id, [f"mpe2/{x}" for x in known])
+    limit = {} if max_episode_steps is None else {"max_cycles": max_episode_steps}
+    return importlib.import_module(f"mpe2.{name}").parallel_env(**limit, **kwargs)
 
 
 def _not_installed(env_id: str, error: Exception) -> UserError:
@@ -104,6 +123,8 @@ def _unknown(env_id: str, known: list[str]) -> UserError:
 
 
 def _extra(env_id: str) -> str:
+    if env_id.startswith("mpe2/"):
+        return "pgkit[agents]"
     if env_id.startswith("dm_control/"):
         return "shimmy[dm-control]"
     entry = _entry_point(env_id)

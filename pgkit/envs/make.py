@@ -15,13 +15,16 @@ from gymnasium.vector import VectorEnv as GymVectorEnv
 from torchrl.envs import EnvBase
 
 from pgkit.envs.action_repeat import ActionRepeat
+from pgkit.envs.agents import Names
 from pgkit.envs.gym_list import Gymnasium
 from pgkit.envs.gym_vector import GymnasiumVector
 from pgkit.envs.ids import make_one
 from pgkit.envs.numpy_entries import Info
+from pgkit.envs.parallel import Parallel, is_parallel, refuse_turns
 from pgkit.envs.seeding import episode_seed
 from pgkit.envs.torch_batch import Torch
 from pgkit.envs.vector import VectorEnv
+from pgkit.envs.vmas_batch import Vmas
 from pgkit.errors import UserError, check_whole_number
 from pgkit.seams import Simulator
 
@@ -34,6 +37,7 @@ class Settings(NamedTuple):
     flatten: bool = True
     info: Info = ()
     time_limit: int | None = None
+    groups: Names | None = None
 
 
 def make(
@@ -47,15 +51,17 @@ def make(
     flatten: bool = True,
     info: Info = (),
     max_episode_steps: int | None = None,
+    groups: Names | None = None,
     **kwargs: Any,
 ) -> VectorEnv:
     """Makes a vector of environments.
 
     Args:
-        env_id: a Gymnasium id, ``dm_control/<domain>-<task>-v0`` (also ``dmc:<domain>-<task>``); a vector of
-            Gymnasium's (``gymnasium.make_vec(...)``); a TorchRL ``EnvBase`` with one batch dimension or none; or a
-            function or class. What that returns decides what it is: one ``gym.Env`` (or ``dm_env``), a new one at
-            every call, or one of the former. It gets ``num_envs``, ``seed`` and ``device`` if it names them.
+        env_id: a Gymnasium id, ``dm_control/<domain>-<task>-v0`` (also ``dmc:<domain>-<task>``),
+            ``vmas/<scenario>``, ``mpe2/<name>``; a vector of Gymnasium's (``gymnasium.make_vec(...)``); a TorchRL
+            ``EnvBase`` with one batch dimension or none; or a function or class. What that returns decides what it is:
+            one ``gym.Env``, ``dm_env`` or PettingZoo ``ParallelEnv``, a new one at every call, or one of the former. It
+            gets ``num_envs``, ``seed`` and ``device`` if it names them.
         num_envs: number of environments; 1 by default, and what an object that is given has.
         seed: seed of the whole vector; environment ``i`` gets its own stream.
         device: where a TorchRL environment is to be; NumPy environments are on the CPU.
@@ -66,7 +72,9 @@ def make(
             action masks.
         info: entries of ``info`` that reach the rollout under ``("next", name)``: names of single numbers, or a
             mapping from names to TorchRL specs of one environment's.
-        max_episode_steps: time limit; None: the id's own, which a function or class has none of.
+        max_episode_steps: time limit; None: the id's own (VMAS's: 100), which a function or class has none of.
+        groups: of many agents, their names by the name of their group; None: one group, or by the beginnings of their
+            names where their spaces differ.
         **kwargs: passed to ``gymnasium.make``, to the dm_control task, or to the function or class.
 
     Raises:
@@ -82,7 +90,8 @@ def make(
         if workers > 1 or kwargs:
             what = f"workers={workers}" if workers > 1 else f"{next(iter(kwargs))}=..."
             raise UserError(f"{what} with an environment that is made already: give a function that makes one")
-        return _adopt(env_id, num_envs, seed, Settings(device, action_repeat, flatten, info, max_episode_steps))
+        given = Settings(device, action_repeat, flatten, info, max_episode_steps, groups)
+        return _adopt(env_id, num_envs, seed, given)
     num_envs = 1 if num_envs is None else num_envs
     if num_envs < 1 or workers < 1 or workers > num_envs:
         raise UserError(
@@ -92,7 +101,7 @@ def make(
     limited = isinstance(env_id, str) and not env_id.startswith(("dm_control/", "dmc:"))  # by Gymnasium
     if limited and max_episode_steps is not None:
         kwargs["max_episode_steps"] = max_episode_steps
-    settings = Settings(device, action_repeat, flatten, info, None if limited else max_episode_steps)
+    settings = Settings(device, action_repeat, flatten, info, None if limited else max_episode_steps, groups)
     function = _function(env_id, kwargs)
     env = VectorEnv(partial(_share, function, settings), num_envs, seed, workers)
     env.env_id = env_id if isinstance(env_id, str) else getattr(env_id, "__qualname__", type(env_id).__name__)
@@ -127,6 +136,8 @@ def _adopt(env: EnvBase | GymVectorEnv, num_envs: int | None, seed: int, setting
 
 
 def _function(env_id: Any, kwargs: dict[str, Any]) -> Callable[..., Any]:
+    if isinstance(env_id, str) and env_id.startswith("vmas/"):
+        return partial(Vmas, env_id.removeprefix("vmas/"), **kwargs)
     if isinstance(env_id, str):
         return partial(make_one, env_id, **kwargs)
     if not callable(env_id) or isinstance(env_id, gym.Env):
@@ -140,7 +151,7 @@ def _function(env_id: Any, kwargs: dict[str, Any]) -> Callable[..., Any]:
 def _share(function: Callable[..., Any], settings: Settings, first: int, count: int, seed: int) -> Simulator:
     """The environments ``first`` to ``first + count``: what the function makes decides how."""
     own_seed = seed if first == 0 else episode_seed(seed, first, 0)
-    given = {"num_envs": count, "seed": own_seed, "device": settings.device}
+    given = {"num_envs": count, "seed": own_seed, "device": settings.device, "groups": settings.groups}
     names = _named(function) - {name for name, value in given.items() if value is None}
     made = function(**{name: given[name] for name in names & given.keys()})
     if isinstance(made, EnvBase | GymVectorEnv):
@@ -150,10 +161,19 @@ def _share(function: Callable[..., Any], settings: Settings, first: int, count: 
                 f"the function made {simulator.num_envs} environments where num_envs={count}: let it take num_envs"
             )
         return simulator
+    if isinstance(made, Simulator):
+        _only_for_single(settings, made)
+        return made
+    refuse_turns(made)
     rest = []
     for i in range(first + 1, first + count):
         given["seed"] = episode_seed(seed, i, 0)
         rest.append(function(**{name: given[name] for name in names & given.keys()}))
+    if is_parallel(made):
+        _only_for_single(settings, made)
+        return Parallel([made, *rest], seed, first, settings.groups)
+    if settings.groups is not None:
+        raise UserError(f"groups= is for environments with many agents, {type(made).__name__} has one: leave it out")
     _warn_of_statistics(made)
     envs = [_one(env, settings) for env in (made, *rest)]
     return Gymnasium(envs, seed, first, settings.flatten, settings.info)
@@ -169,6 +189,18 @@ def _named(function: Any) -> set[str]:
         return set(inspect.signature(function.__init__ if isinstance(function, type) else function).parameters) - taken
     except (TypeError, ValueError):  # built in
         return set()
+
+
+def _only_for_single(settings: Settings, env: Any) -> None:
+    """A ``UserError`` for a setting that environments with many agents do not have."""
+    given = {
+        "action_repeat=": settings.action_repeat > 1, "max_episode_steps=": settings.time_limit is not None,
+        "info=": bool(settings.info), "flatten=False": not settings.flatten,
+    }  # fmt: skip
+    if named := [name for name, is_given in given.items() if is_given]:
+        raise UserError(
+            f"{named[0]} is for single Gymnasium environments, this is a {type(env).__name__}: leave it out"
+        )
 
 
 def _simulator(env: EnvBase | GymVectorEnv, seed: int, first: int, settings: Settings) -> Simulator:

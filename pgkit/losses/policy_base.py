@@ -111,7 +111,7 @@ class PolicyLoss(Loss):
             self.convert_to_functional(critic_network, "critic_network", compare_against=shared)
         several = (list(actor_network.dist_sample_keys), list(actor_network.log_prob_keys))
         action, log_prob = (keys[0] if len(keys) == 1 else keys for keys in several)
-        self.set_keys(action=action, sample_log_prob=log_prob)
+        self.set_keys(action=action, sample_log_prob=log_prob, **_under_group(critic_network))
         for name, value in {
             "entropy_coeff": entropy_coeff,
             "critic_coeff": critic_coeff,
@@ -223,11 +223,16 @@ class PolicyLoss(Loss):
         advantage = batch.get(self.tensor_keys.advantage)
         return standardize(advantage, self.mask(advantage, batch)) if self.normalize_advantage else advantage
 
-    @staticmethod
-    def mask(entry: Tensor, batch: TensorDictBase) -> Tensor | None:
-        """Which elements of an entry ``[*B, 1]`` are no padding, in its shape; None if the batch has none."""
-        mask = batch.get(("collector", "mask"), None)
-        return None if mask is None else mask.reshape(entry.shape)
+    def mask(self, entry: Tensor, batch: TensorDictBase) -> Tensor | None:
+        """Which elements of an entry ``[*B, 1]`` are no padding, in its shape; None if the batch has no mask."""
+        found = [x for key in self._loss_mask_keys() if (x := batch.get(key, None)) is not None]
+        return torch.stack([self._expand_loss_mask(x, entry) for x in found]).all(0) if found else None
+
+    def _loss_mask_keys(self) -> tuple[NestedKey, ...]:
+        """TorchRL's, and the mask of the group whose actions these are: its agents that are gone do not count."""
+        action, keys = listed(self.tensor_keys.action)[0], super()._loss_mask_keys()
+        grouped = not isinstance(action, str) and self.loss_mask_key == "auto"
+        return (*keys, (*action[:-1], "mask")) if grouped else keys
 
     def result(self, batch: TensorDictBase, objective: Tensor, dist: Distribution) -> TensorDict:
         """Losses and metrics of an unreduced ``objective [*B, 1]``, to be maximized; of entropy and value too."""
@@ -293,6 +298,14 @@ class PolicyLoss(Loss):
         if self._value_estimator is not None:
             accepted = {field.name for field in fields(self._value_estimator._AcceptedKeys)}
             self._value_estimator.set_keys(**{k: v for k, v in kwargs.items() if k in accepted})
+
+
+def _under_group(critic: TensorDictModule | None) -> dict[str, NestedKey]:
+    """The keys of a critic whose values lie in a group of agents, ``("agents", "state_value")``; none for any other."""
+    value = next((key for key in critic.out_keys if key[-1] == "state_value"), None) if critic is not None else None
+    if value is None:
+        return {}
+    return {"value": value, **{name: (*value[:-1], name) for name in ("advantage", "value_target")}}
 
 
 ActorCriticLoss = PolicyLoss  # its name while the settings of entropy and value had a class of their own

@@ -119,6 +119,11 @@ def _team(who: Agents, centralized: Centralized) -> tuple[list[nn.Module], list[
     """Modules between the observation and the hidden layers, those after the head, and how many observations count."""
     if centralized is not False and who.name is None:
         raise UserError("centralized= is for a group of agents, the environment has one agent")
+    if not isinstance(centralized, bool | str) and centralized[0] == who.name:
+        raise UserError(
+            f"centralized={centralized}: that is each agent's own, in the group '{who.name}': centralized=True reads "
+            "all agents' observations, a key at the root names a state that they share"
+        )
     ids: list[nn.Module] = [AgentIds(who.number)] if who.ids else []
     if centralized is False:
         return ids, [], 1

@@ -96,8 +96,8 @@ def play(policy: Any, env: Any, episodes: int, deterministic: bool = True) -> tu
             ended, begun, fresh = step.ended(), step.begun().clone(), step.fresh
             _warn_of_length(simulator.step_count[~ended])
             if ended.any():
-                totals = [x.flatten(1).double().mean(1) for x in simulator.episode_reward.values()]
-                returns = torch.stack(totals).mean(0)
+                totals = [x.flatten(1).double() for x in simulator.episode_reward.values()]
+                returns = torch.cat(totals, 1).mean(1)
                 for slot in ended.nonzero().flatten().tolist():
                     if len(finished[slot]) < share[slot]:
                         finished[slot].append((float(returns[slot]), int(simulator.step_count[slot])))

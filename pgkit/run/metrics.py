@@ -13,6 +13,7 @@ from statistics import fmean
 from typing import Any
 
 import numpy as np
+import torch
 from tensordict import TensorDictBase
 
 from pgkit import files
@@ -137,12 +138,19 @@ _NO_INFO = {"reward", "done", "terminated", "truncated", "episode_reward", "step
 def finished_episodes(rollout: TensorDictBase | None) -> list[tuple[float, int]]:
     """``(return, length)`` of the episodes that end in a rollout ``[num_envs, T]``, oldest first.
 
-    A rollout without TorchRL's ``episode_reward`` and ``step_count`` entries has none.
+    Of several agents, the return is their mean. A rollout without TorchRL's ``episode_reward`` and ``step_count``
+    entries has none.
     """
-    if rollout is None or not (done := rollout["next", "done"]).any() or "episode_reward" not in rollout["next"].keys():
+    if rollout is None or not (done := rollout["next", "done"]).any():
+        return []
+    following = rollout["next"]
+    totals = [key for key in following.keys(True, True) if "episode_reward" in (key, key[-1])]
+    if not totals:
         return []
     done = done.squeeze(-1).T
-    rewards, lengths = (rollout["next", name].squeeze(-1).T[done] for name in ("episode_reward", "step_count"))
+    returns = torch.cat([following[key].flatten(2) for key in totals], -1)
+    rewards = (returns.squeeze(-1) if returns.shape[-1] == 1 else returns.double().mean(-1)).T[done]
+    lengths = following["step_count"].squeeze(-1).T[done]
     return list(zip(rewards.tolist(), lengths.tolist(), strict=True))
 
 
