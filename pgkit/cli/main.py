@@ -4,10 +4,10 @@ import argparse
 import runpy
 import sys
 from collections.abc import Sequence
-from importlib import metadata
 from pathlib import Path
 from typing import NoReturn
 
+from pgkit import __version__
 from pgkit.cli import policies, recipes, studies
 from pgkit.cli.beside import look_beside
 from pgkit.cli.exits import exits
@@ -34,7 +34,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 def parser() -> Parser:
     """The command line's grammar."""
     top = Parser(prog="pgkit", description="Policy-gradient building blocks on TorchRL.", allow_abbrev=False)
-    top.add_argument("--version", action="version", version=f"pgkit {version()}")
+    top.add_argument("--version", action="version", version=f"pgkit {__version__}")
     commands = top.add_subparsers(required=True, metavar="COMMAND")
 
     command = commands.add_parser("ls", help="list the recipes")
@@ -63,14 +63,6 @@ def parser() -> Parser:
     command.set_defaults(command=plot_runs)
     studies.add(commands)
     return top
-
-
-def version() -> str:
-    """The installed version; a source tree on the path that was never installed has none."""
-    try:
-        return metadata.version("pgkit")
-    except metadata.PackageNotFoundError:
-        return "(source tree, not installed)"
 
 
 def positive(text: str) -> int:

@@ -17,6 +17,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 from torch.distributions import Distribution
 from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import DistributionalQValueModule
 
 from pgkit import files
 from pgkit.envs.spaces import ToEnv
@@ -136,13 +137,15 @@ def needs(package: str, extra: str) -> Any:
     try:
         return importlib.import_module(package)
     except ImportError:
-        raise UserError(f"this needs {package}: pip install -e '.[{extra}]' in pgkit's folder") from None
+        raise UserError(f'this needs {package}: pip install "pgkit-rl[{extra}]"') from None
 
 
 @contextlib.contextmanager
 def _traceable() -> Iterator[None]:
-    """Distributions check no values, which a graph cannot, and the exporters keep what they would say to themselves."""
+    """Nobody checks values, which a graph cannot, and the exporters keep what they would say to themselves."""
     loud, checks = getLogger("torch.onnx"), Distribution._validate_args
+    expected = DistributionalQValueModule._support_expected
+    DistributionalQValueModule._support_expected = _expected
     level = loud.level
     loud.setLevel(ERROR)
     Distribution.set_default_validate_args(False)
@@ -152,4 +155,11 @@ def _traceable() -> Iterator[None]:
             yield
     finally:
         Distribution.set_default_validate_args(checks)
+        DistributionalQValueModule._support_expected = expected
         loud.setLevel(level)
+
+
+def _expected(module: Any, log_probs: Tensor, support: Tensor | None = None) -> Tensor:
+    """TorchRL's mean of a return's distribution, ``[N, atoms, actions]`` to ``[N, actions]``, without its check."""
+    support = module.support if support is None else support
+    return (log_probs.exp() * support.unsqueeze(-1)).sum(-2)

@@ -77,9 +77,8 @@ class Policy:
         entries, single = {}, False
         for name, shape in shapes.items():
             if name not in given:
-                raise UserError(
-                    f"predict got {', '.join(map(dotted, given))}; the policy takes the entries {', '.join(map(dotted, shapes))}"
-                )
+                had, reads = (", ".join(map(dotted, keys)) for keys in (given, shapes))
+                raise UserError(f"predict got {had}; the policy takes the entries {reads}")
             x = np.asarray(given[name], dtype=self.dtype(name))
             single = x.shape == shape
             if not single and x.shape[1:] != shape:

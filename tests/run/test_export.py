@@ -241,7 +241,7 @@ from pgkit import modules, run
 class Args(run.RunArgs):
     width: int = 4
 
-def agent(args, env):
+def agent(args: Args, env):
     return run.Agent(modules.gaussian_actor(env, hidden=(args.width,)))
 
 def main(args):
