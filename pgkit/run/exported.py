@@ -9,7 +9,7 @@ import warnings
 from collections.abc import Iterator
 from logging import ERROR, getLogger
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -41,12 +41,12 @@ class Acts(nn.Module):
 
     def __init__(self, policy: Policy) -> None:
         super().__init__()
-        memory = policy.memory
+        memory, actor = policy.memory, cast(Any, policy.actor)
         self.actor, self.key, self.keys = policy.actor, policy.action_key, list(policy.shapes)
         self.after: Key | None = None
         if memory is not None:
             self.keys += ["is_init", memory.state_key]
-            self.after = next(key for key in policy.actor.out_keys if key[-1] == "recurrent_state")
+            self.after = next(key for key in actor.out_keys if key[-1] == "recurrent_state")
         self.names = [dotted(key) for key in self.keys]
         self.results = ["action", "next_recurrent_state"] if memory is not None else ["action"]
         self.bounds = InBounds(policy.to_env)
@@ -59,6 +59,10 @@ class Acts(nn.Module):
 
 class InBounds(nn.Module):
     """:class:`~pgkit.envs.spaces.ToEnv` on tensors: ``[N, ...]`` clipped, rounded, of the environment's type."""
+
+    low: Tensor
+    high: Tensor
+    start: Tensor
 
     def __init__(self, to_env: Any) -> None:
         super().__init__()
@@ -161,5 +165,5 @@ def _traceable() -> Iterator[None]:
 
 def _expected(module: Any, log_probs: Tensor, support: Tensor | None = None) -> Tensor:
     """TorchRL's mean of a return's distribution, ``[N, atoms, actions]`` to ``[N, actions]``, without its check."""
-    support = module.support if support is None else support
-    return (log_probs.exp() * support.unsqueeze(-1)).sum(-2)
+    atoms: Tensor = module.support if support is None else support
+    return (log_probs.exp() * atoms.unsqueeze(-1)).sum(-2)

@@ -46,12 +46,14 @@ class Policy:
         """Of the observation's entries that the actor reads, by key."""
         given = self.observation_shape
         given = given if isinstance(given, dict) else {"observation": given}
-        return {key: shape for key, shape in given.items() if key in self.actor.in_keys}
+        actor: Any = self.actor
+        return {key: shape for key, shape in given.items() if key in actor.in_keys}
 
     @property
     def action_key(self) -> Key:
         """The entry that the actor writes its action to; a group's lies under the group's name."""
-        return next((key for key in self.actor.out_keys if key == "action" or key[-1] == "action"), "action")
+        actor: Any = self.actor
+        return next((key for key in actor.out_keys if key == "action" or key[-1] == "action"), "action")
 
     @property
     def memory(self) -> Memory | None:

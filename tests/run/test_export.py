@@ -147,7 +147,7 @@ def test_the_graph_gives_what_predict_gives(tmp_path: Path):
         policy = policy_of(kind)
         session = onnxruntime.InferenceSession(run.export(policy, tmp_path / "policy.onnx"))
         obs = np.random.default_rng(0).normal(size=(50, 3)).astype("f4") * 5
-        found, predicted = session.run(None, {"observation": obs})[0], policy.predict(obs)
+        found, predicted = np.asarray(session.run(None, {"observation": obs})[0]), policy.predict(obs)
         np.testing.assert_allclose(found, predicted, rtol=0, atol=1e-5)
         if kind == "gaussian":  # some are clipped, to each dimension's own bound
             assert (found == np.float32([-2, 0])).any(0).all() and (found <= np.float32([1, 5])).all()

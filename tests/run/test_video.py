@@ -65,6 +65,7 @@ def test_a_gif_where_there_is_no_codec(policy: run.Policy, tmp_path: Path, monke
 
 
 def test_what_is_missing_is_one_line(policy: run.Policy, tmp_path: Path, monkeypatch: Any):
+    assert policy.args is not None
     policy.args.env["works"] = False
     with pytest.raises(UserError, match=r"cannot be rendered \(no display name\).*MUJOCO_GL=egl"):
         video.record(policy, tmp_path / "out.gif", 1)
