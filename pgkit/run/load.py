@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -26,7 +27,7 @@ def load_policy(
     A policy folder, which :func:`export` writes, holds one policy: ``which`` says nothing there.
     """
     run_dir = Path(run_dir)
-    if (run_dir / ABOUT).is_file():
+    if os.path.isfile(run_dir / ABOUT):  # False also for a name that no file can have
         return _from_folder(run_dir, agent, trust)
     built, args, env, frames = restored(run_dir, which, agent, trust, only_actor=True)
     return Policy(built.actor.eval(), args.make_env, **describe_env(env), frames=frames, args=args)

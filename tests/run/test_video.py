@@ -48,6 +48,7 @@ def policy() -> run.Policy:
     return run.Policy(modules.categorical_actor(env), args.make_env, **run.policy.describe_env(env), args=args)
 
 
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # imageio leaves its reader's pipes open
 @pytest.mark.parametrize("name", ["out.mp4", "out.gif"])
 def test_every_frame_of_every_episode(policy: run.Policy, tmp_path: Path, name: str):
     scores, file = video.record(policy, tmp_path / name, episodes=2)
