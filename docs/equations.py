@@ -16,4 +16,5 @@ def on_page_content(content: str, **_: Any) -> str:
 
 def _mathml(match: re.Match[str]) -> str:
     display = "inline" if match[1] == "span" else "block"
-    return convert(html.unescape(match[2]).strip(), display=display)
+    math = convert(html.unescape(match[2]).strip(), display=display)
+    return math if display == "inline" else f'<div class="equation">{math}</div>'

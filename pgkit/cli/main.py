@@ -1,14 +1,14 @@
-"""``pgkit ls / cp / run / eval / plot``. Heavy imports wait until a command needs them."""
+"""``pgkit ls / cp / run / eval / export / plot``. Heavy imports wait until a command needs them."""
 
 import argparse
 import runpy
 import sys
 from collections.abc import Sequence
-from importlib import metadata
 from pathlib import Path
 from typing import NoReturn
 
-from pgkit.cli import recipes, studies
+from pgkit import __version__
+from pgkit.cli import policies, recipes, studies
 from pgkit.cli.beside import look_beside
 from pgkit.cli.exits import exits
 from pgkit.errors import UserError
@@ -34,7 +34,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 def parser() -> Parser:
     """The command line's grammar."""
     top = Parser(prog="pgkit", description="Policy-gradient building blocks on TorchRL.", allow_abbrev=False)
-    top.add_argument("--version", action="version", version=f"pgkit {version()}")
+    top.add_argument("--version", action="version", version=f"pgkit {__version__}")
     top.set_defaults(takes_flags=False, flags=[])
     commands = top.add_subparsers(required=True, metavar="COMMAND")
 
@@ -51,13 +51,7 @@ def parser() -> Parser:
     command.add_argument("flags", nargs=argparse.REMAINDER, help="the recipe's own").required = False
     command.set_defaults(command=run_recipe)
 
-    command = commands.add_parser("eval", help="play whole episodes with a trained policy")
-    command.add_argument("run_dir", type=Path, metavar="RUN_DIR")
-    command.add_argument("--episodes", type=positive, default=10, help="how many (default: 10)")
-    command.add_argument("--seed", type=int, default=0, help="of the envs (default: 0)")
-    command.add_argument("--which", choices=["best", "latest"], default="best", help="checkpoint (default: best)")
-    command.add_argument("--trust", action="store_true", help="run the recipe file and import what RUN_DIR names")
-    command.set_defaults(command=evaluate_run)
+    policies.add(commands, positive)
 
     command = commands.add_parser("plot", help="draw the learning curves of runs; seeds are averaged")
     command.add_argument("run_dirs", type=Path, nargs="+", metavar="RUN_DIR")
@@ -70,14 +64,6 @@ def parser() -> Parser:
     command.set_defaults(command=plot_runs)
     studies.add(commands)
     return top
-
-
-def version() -> str:
-    """The installed version; a source tree on the path that was never installed has none."""
-    try:
-        return metadata.version("pgkit")
-    except metadata.PackageNotFoundError:
-        return "(source tree, not installed)"
 
 
 def positive(text: str) -> int:
@@ -128,20 +114,6 @@ def run_recipe(args: argparse.Namespace) -> None:
 
     settings = {name.lower(): vars(recipe).get(name) for name in ("PRESETS", "VARIANTS")}
     run.launch(recipe.main, recipe.Args, argv=[*variant, *args.flags], **settings)
-
-
-def evaluate_run(args: argparse.Namespace) -> None:
-    from pgkit import run
-
-    policy = run.load_policy(args.run_dir, args.which, trust=args.trust)
-    env = policy.make_env(num_envs=min(args.episodes, 10), seed=args.seed)
-    try:
-        scores = run.evaluate(policy.actor, env, args.episodes)
-    finally:
-        env.close()
-    print(f"{args.run_dir}: {args.which} policy, after {policy.frames:,} frames, {args.episodes} episodes")
-    for name, value in scores.items():
-        print(f"  {name.removeprefix('eval/'):<16} {value:.2f}")
 
 
 def plot_runs(args: argparse.Namespace) -> None:

@@ -30,7 +30,7 @@ class GymTask:
         try:
             import reasoning_gym
         except ImportError:
-            raise UserError(f"reasoning_gym/{name} needs reasoning-gym: pip install 'pgkit[reasoning]'") from None
+            raise UserError(f"reasoning_gym/{name} needs reasoning-gym: pip install 'pgkit-rl[reasoning]'") from None
         try:
             self.data = reasoning_gym.create_dataset(name, size=size, seed=0, **settings)
         except ValueError as error:

@@ -197,7 +197,7 @@ class SoftQLoss(QLoss):
 
 @runtime_checkable
 class _Weight(Protocol):
-    """What weighs the entropy."""
+    """The weight of the entropy."""
 
     alpha: Tensor
 

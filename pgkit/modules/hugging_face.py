@@ -49,7 +49,7 @@ def _load(kind: Callable[[Any], Any], path: Path, **settings: Any) -> Any:
     try:
         import transformers
     except ImportError:
-        raise UserError("models of Hugging Face need transformers: pip install 'pgkit[llm]'") from None
+        raise UserError('models of Hugging Face need transformers: pip install "pgkit-rl[llm]"') from None
     if not path.exists():
         raise UserError(f"{path}: no such folder or .gguf file (models are read from the disk, never downloaded)")
     folder, file = (path.parent, {"gguf_file": path.name}) if path.suffix == ".gguf" else (path, {})

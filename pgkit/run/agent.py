@@ -55,7 +55,7 @@ class Agent:
     def state_dict(self) -> dict[str, Any]:
         """The state of each part, and the plain numbers that the actor holds, which may be annealed."""
         parts = {name: part.state_dict() for name, part in vars(self).items() if isinstance(part, nn.Module)}
-        return {"parts": parts, "numbers": _numbers(self.actor)}
+        return {"parts": parts, "numbers": numbers(self.actor)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restores :meth:`state_dict`.
@@ -79,7 +79,7 @@ def load_part(part: nn.Module, state: dict[str, Any]) -> None:
     part.load_state_dict(state)
 
 
-def _numbers(module: nn.Module) -> dict[str, Any]:
+def numbers(module: nn.Module) -> dict[str, Any]:
     """The numbers that a module's parts hold as plain attributes, by their path."""
     return {
         f"{path}.{name}": value
@@ -89,12 +89,12 @@ def _numbers(module: nn.Module) -> dict[str, Any]:
     }
 
 
-def set_numbers(module: nn.Module, numbers: dict[str, Any]) -> None:
+def set_numbers(module: nn.Module, saved: dict[str, Any]) -> None:
     """Gives the parts of a module the numbers that they had when they were saved."""
-    for name in numbers.keys() & (now := _numbers(module)).keys():
-        if now[name] != numbers[name]:
+    for name in saved.keys() & (now := numbers(module)).keys():
+        if now[name] != saved[name]:
             path, _, attribute = name.rpartition(".")
-            setattr(module.get_submodule(path), attribute, numbers[name])
+            setattr(module.get_submodule(path), attribute, saved[name])
 
 
 def rebuild(run_dir: Path, make: Callable[..., Agent] | None, trust: bool) -> tuple[Agent, RunArgs, Any]:
@@ -121,6 +121,7 @@ def _makes(run_dir: Path, trust: bool) -> Callable[..., Agent]:
         )
     if file is not None and not trust:
         raise UserError(f"{run_dir} is a run of {file}, which would be run: --trust (trust=True) where you trust it")
+    file = file and str(run_dir / file)  # of a policy folder, the recipe that lies in it
     if file is not None and not Path(file).is_file():
         raise UserError(
             f"{run_dir} is a run of {file}, which is not there: put it back, or give load_policy(..., agent=)"

@@ -19,13 +19,13 @@ from typing import Any, TypeVar
 
 import torch
 
-from pgkit import files
+from pgkit import __version__, files
 from pgkit.cli import recipes
 from pgkit.errors import UserError
 from pgkit.run.args import RunArgs, free_on_resume, of_type
 
 A = TypeVar("A", bound=RunArgs)
-PACKAGES = ("pgkit", "torch", "torchrl", "tensordict", "numpy", "gymnasium", "mujoco", "dm-control", "shimmy")
+PACKAGES = ("torch", "torchrl", "tensordict", "numpy", "gymnasium", "mujoco", "dm-control", "shimmy")
 _TEXT = (str, type(None))
 _KINDS = {"settings": dict, "command": list, "resumed_at": list, "id": str, "may_change": list, "file": _TEXT}
 
@@ -149,7 +149,7 @@ def as_resumed(args: RunArgs, run_dir: Path) -> None:
 
 def versions() -> dict[str, str]:
     """Versions of Python and of the packages that can change a run's numbers."""
-    found = {"python": platform.python_version()}
+    found = {"python": platform.python_version(), "pgkit": __version__}
     for name in PACKAGES:
         try:
             found[name] = metadata.version(name)

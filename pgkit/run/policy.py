@@ -1,16 +1,18 @@
-"""A trained policy, loaded from a run directory, on plain NumPy."""
+"""A trained policy on plain NumPy."""
+
+from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
 from pgkit.errors import UserError
-from pgkit.run.agent import Agent, Which, restored
+from pgkit.run.args import RunArgs
 from pgkit.run.evaluate import Acting
+from pgkit.seams import Key, Memory
 
 
 @dataclass
@@ -24,14 +26,43 @@ class Policy:
 
     actor: torch.nn.Module
     make_env: Callable[..., Any]
-    observation_shape: tuple[int, ...] | dict[str, tuple[int, ...]]
+    observation_shape: tuple[int, ...] | dict[Any, tuple[int, ...]]
     to_env: Callable[[np.ndarray], np.ndarray] | None = None
     frames: int = 0
-    observation_dtype: dict[str, str] = field(default_factory=dict)
+    observation_dtype: dict[Any, str] = field(default_factory=dict)
+    args: RunArgs | None = None
 
     def __post_init__(self) -> None:
-        self._acting = Acting(self.actor)
+        self._acting = Acting(self.actor, (self.action_key,))
         self._begins = True
+
+    @classmethod
+    def of(cls, actor: torch.nn.Module, env: Any) -> Policy:
+        """The policy of an actor in your own script; ``env`` is what ``envs.make`` gave, and has no other use."""
+        return cls(actor, lambda **_: env, **describe_env(env))
+
+    @property
+    def shapes(self) -> dict[Key, tuple[int, ...]]:
+        """Of the observation's entries that the actor reads, by key."""
+        given = self.observation_shape
+        given = given if isinstance(given, dict) else {"observation": given}
+        actor: Any = self.actor
+        return {key: shape for key, shape in given.items() if key in actor.in_keys}
+
+    @property
+    def action_key(self) -> Key:
+        """The entry that the actor writes its action to; a group's lies under the group's name."""
+        actor: Any = self.actor
+        return next((key for key in actor.out_keys if key == "action" or key[-1] == "action"), "action")
+
+    @property
+    def memory(self) -> Memory | None:
+        """The part whose state goes from step to step."""
+        return next((part for part in self.actor.modules() if isinstance(part, Memory)), None)
+
+    def dtype(self, key: Key) -> str:
+        """The type of an observation's entry, such as ``float32``."""
+        return self.observation_dtype.get(key, "float32")
 
     def reset(self) -> None:
         """An episode begins at the next :meth:`predict`: a recurrent policy forgets. No other needs it."""
@@ -43,25 +74,30 @@ class Policy:
         Where the policy reads the entries of a Dict, ``obs`` is a mapping from their names to arrays. The actions are
         what the environment takes: continuous ones are clipped to its bounds. A wrong shape is a UserError.
         """
-        shapes = self.observation_shape
-        shapes = shapes if isinstance(shapes, dict) else {"observation": shapes}
+        shapes = self.shapes
         given = obs if isinstance(obs, Mapping) else {"observation": obs}
         entries, single = {}, False
         for name, shape in shapes.items():
             if name not in given:
-                raise UserError(f"predict got {', '.join(given)}; the policy takes the entries {', '.join(shapes)}")
-            x = np.asarray(given[name], dtype=self.observation_dtype.get(name, "float32"))
+                had, reads = (", ".join(map(dotted, keys)) for keys in (given, shapes))
+                raise UserError(f"predict got {had}; the policy takes the entries {reads}")
+            x = np.asarray(given[name], dtype=self.dtype(name))
             single = x.shape == shape
             if not single and x.shape[1:] != shape:
                 raise UserError(
-                    f"predict got an {name} of shape {list(x.shape)}; the policy takes {list(shape)} or a batch"
+                    f"predict got an {dotted(name)} of shape {list(x.shape)}; the policy takes {list(shape)} or a batch"
                 )
             entries[name] = torch.from_numpy(x[None] if single else x)
         begun = torch.full((len(next(iter(entries.values()))),), self._begins)
-        action = self._acting(entries, begun, deterministic)["action"].cpu().numpy()
+        action = self._acting(entries, begun, deterministic)[self.action_key].cpu().numpy()
         self._begins = False
         action = action if self.to_env is None else self.to_env(action)
         return action[0] if single else action
+
+
+def dotted(key: Key) -> str:
+    """A nested key as one name: ``agents.observation``."""
+    return key if isinstance(key, str) else ".".join(key)
 
 
 def describe_env(env: Any) -> dict[str, Any]:
@@ -74,15 +110,3 @@ def describe_env(env: Any) -> dict[str, Any]:
         "to_env": env.to_env,
         "observation_dtype": {name: dtype for name, dtype in dtypes.items() if dtype != "float32"},
     }
-
-
-def load_policy(
-    run_dir: str | Path,
-    which: Which = "best",
-    *,
-    agent: Callable[..., Agent] | None = None,
-    trust: bool = False,
-) -> Policy:
-    """The policy of a run: ``best`` by ``eval/mean_reward``, or ``latest``; arguments as in :func:`load_agent`."""
-    built, args, env, frames = restored(Path(run_dir), which, agent, trust, only_actor=True)
-    return Policy(built.actor.eval(), args.make_env, **describe_env(env), frames=frames)

@@ -143,7 +143,7 @@ def _refuse(names: Sequence[str], contenders: dict[str, Contender]) -> None:
         sys.exit(f"error: no contender {unknown[0]!r}; there are: {', '.join(contenders)}")
     missing = sorted({contenders[name].needs for name in names if find_spec(contenders[name].needs) is None})
     if missing:
-        sys.exit(f'error: {", ".join(missing)} not installed; run: pip install "pgkit[bench]"')
+        sys.exit(f"error: {', '.join(missing)} not installed; run: pip install 'pgkit-rl[bench]'")
 
 
 def _say(text: str) -> None:
