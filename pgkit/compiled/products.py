@@ -1,7 +1,7 @@
 """Which kernel makes each large matrix product of a recorded graph on this CPU: measured once, then kept.
 
-A choice has to be the same one again for a run to repeat itself to the bit: it lies in a file by CPU and threads, in the
-state of an update, and goes to the worker processes.
+A run repeats itself to the bit if the choices are the same again: they lie in a file by CPU and threads and in the
+state of an update, and go to the worker processes.
 """
 
 from __future__ import annotations
