@@ -18,7 +18,7 @@ from functools import partial
 from hashlib import sha256
 from logging import getLogger
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, cast, get_args
 
 import torch
 from torch import Tensor
@@ -49,7 +49,7 @@ def set_matmul(matmul: str) -> None:
     global _setting
     if matmul not in get_args(Matmul):
         raise UserError(f"matmul is 'auto', 'float32' or 'bf16', not {matmul!r}")
-    _setting = matmul
+    _setting = cast(Matmul, matmul)
 
 
 def matmul_state() -> dict[str, Any]:
