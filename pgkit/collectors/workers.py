@@ -19,7 +19,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from pgkit.collectors.stepping import Share, allocate, regroup
-from pgkit.compiled import Mode
+from pgkit.compiled import Mode, load_matmul_state, matmul_state
 from pgkit.envs import VectorEnv
 from pgkit.errors import UserError
 from pgkit.seams import Entries
@@ -64,7 +64,7 @@ class Workers:
             columns = {key: x[:, first:end] for key, x in self._buffers.items()}
             order = _Order(
                 cloudpickle.dumps(env.make), first, end - first, env.num_envs, env.seed, self._actor, outputs, columns,
-                compile,
+                compile, matmul_state(),
             )  # fmt: skip
             process = context.Process(target=_serve, args=(theirs, order), daemon=True)
             process.start()
@@ -175,6 +175,7 @@ class _Order(NamedTuple):
     outputs: Entries
     buffers: Entries
     compile: Mode
+    matmul: dict[str, Any]
 
 
 def _serve(pipe: Connection, order: _Order) -> None:
@@ -182,6 +183,7 @@ def _serve(pipe: Connection, order: _Order) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
     try:
         torch.set_num_threads(1)
+        load_matmul_state(order.matmul)
         simulator = cloudpickle.loads(order.make)(order.first, order.count, order.seed)
         share = Share(
             simulator, order.first, order.num_envs, order.seed, order.actor, order.outputs, order.buffers, order.compile

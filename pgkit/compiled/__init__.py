@@ -2,6 +2,19 @@
 
 from pgkit.compiled.constants import Constants
 from pgkit.compiled.door import Compiled, Mode, check_compile, choose, compiled
+from pgkit.compiled.products import Matmul, load_matmul_state, matmul_state, set_matmul
 from pgkit.compiled.trial import undone
 
-__all__ = ["Compiled", "Constants", "Mode", "check_compile", "choose", "compiled", "undone"]
+__all__ = [
+    "Compiled",
+    "Constants",
+    "Matmul",
+    "Mode",
+    "check_compile",
+    "choose",
+    "compiled",
+    "load_matmul_state",
+    "matmul_state",
+    "set_matmul",
+    "undone",
+]

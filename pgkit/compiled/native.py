@@ -18,6 +18,8 @@ from torch.fx import GraphModule, Node
 from torch.fx.experimental.proxy_tensor import make_fx
 from torch.fx.subgraph_rewriter import replace_pattern
 
+from pgkit.compiled.products import as_they_are, fastest_products
+
 # the same random numbers as eager code
 _OPTIONS: dict[str, Any] = {
     "fallback_random": True,
@@ -103,6 +105,7 @@ def compile_record(graph: GraphModule, inputs: Sequence[Tensor]) -> Callable[...
     from torch._inductor.compile_fx import compile_fx, compile_fx_inner  # 4 seconds, for those who compile
 
     (results,) = graph.graph.output_node().args
+    fastest_products(graph)
     constants = _as_inputs(graph)
     tensors, options = [*inputs, *constants], _OPTIONS
     if all(x.device.type == "cpu" for x in tensors):
@@ -116,7 +119,7 @@ def compile_record(graph: GraphModule, inputs: Sequence[Tensor]) -> Callable[...
         kernels.append((len(taken), compile_fx_inner(graph, taken, **kwargs)))
         return kernels[-1][1]
 
-    with torch.no_grad():
+    with torch.no_grad(), as_they_are():
         code = compile_fx(graph, tensors, inner_compile=compile_kernels, config_patches=options)
     # around the kernels, aliases are taken apart: nothing to do where they take and give what the graph does
     if len(kernels) == 1:

@@ -9,6 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from pgkit.compiled.products import tolerances
+
 
 def undone(tensors: Iterable[Tensor], function: Callable[[], Any]) -> Any:
     """The function's result; what it did to these tensors and to the random generators is undone."""
@@ -43,7 +45,7 @@ def check_repeats(
             continue
         for mine, its in zip(got, expected, strict=True):
             same = mine.shape == its.shape and mine.dtype == its.dtype
-            if not (same and torch.isclose(mine, its, rtol=1e-3, atol=1e-4, equal_nan=True).all()):
+            if not (same and torch.isclose(mine, its, **tolerances(), equal_nan=True).all()):
                 raise RuntimeError(f"it differs on other inputs: {mine} is not {its}")
         if lost := [tuple(x.shape) for x, one, other in zip(held, changed, kept, strict=True) if one and not other]:
             raise RuntimeError(f"it loses what the function writes to a tensor of shape {lost[0]}")

@@ -73,6 +73,9 @@ class RunArgs:
     """Whole episodes, with deterministic actions, in each evaluation."""
     compile: Literal["auto", "on", "off"] = setting("auto", on_resume=True)
     """Compile the update into one graph; auto: when the run is long enough to win the compile time back."""
+    matmul: Literal["auto", "float32", "bf16"] = setting("auto", on_resume=True)
+    """Kernels of large products in compiled updates on a CPU; auto: the fastest in float32 here, measured once;
+    float32: PyTorch's own; bf16: also in bfloat16, less exact, where that is faster."""
     init: Path | None = setting(None, on_resume=True)
     """Begin with the trained agent of this run directory: fine-tuning."""
     resume: Path | None = setting(None, on_resume=True)

@@ -20,6 +20,7 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
 from pgkit import files
+from pgkit.compiled import set_matmul
 from pgkit.envs import vector_of
 from pgkit.errors import Diverged, UserError
 from pgkit.run import checkpoint, config, directory, ending, seeding
@@ -88,6 +89,7 @@ class Run:
                 directory.unlock(self._lock)
                 raise
         torch.set_num_threads(self.args.threads)
+        set_matmul(self.args.matmul)
         seeding.seed_everything(self.args.seed)
         self._handlers: dict[signal.Signals, Any] = {}
         if threading.current_thread() is threading.main_thread():

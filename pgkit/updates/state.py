@@ -8,10 +8,13 @@ from typing import Any
 import torch
 from torch import nn
 
+from pgkit.compiled import load_matmul_state, matmul_state
+
 
 def save(parts: Mapping[str, Any]) -> dict[str, Any]:
-    """The state of every part, empty for None."""
-    return {name: {} if part is None else part.state_dict() for name, part in parts.items()}
+    """The state of every part, empty for None, and which kernels make the products, for the same bits again."""
+    states = {name: {} if part is None else part.state_dict() for name, part in parts.items()}
+    return states | {"products": matmul_state()}
 
 
 def load(parts: Mapping[str, Any], state: Mapping[str, Any]) -> None:
@@ -28,3 +31,4 @@ def load(parts: Mapping[str, Any], state: Mapping[str, Any]) -> None:
                 raise ValueError(f"{key} is {there} there and {here} here")
         if part is not None:
             part.load_state_dict(state[name])
+    load_matmul_state(state.get("products", {}), setting=False)
