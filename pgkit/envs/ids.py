@@ -9,6 +9,8 @@ from typing import Any
 
 import gymnasium as gym
 
+from pgkit.envs.atari import make_atari
+from pgkit.envs.rendering import choose_backend
 from pgkit.errors import UserError
 
 
@@ -18,17 +20,16 @@ def make_one(env_id: str, **kwargs: Any) -> gym.Env:
         env_id = f"dm_control/{env_id.removeprefix('dmc:')}-v0"
     try:
         if "mujoco" in _entry_point(env_id):
+            choose_backend()
             _hear_mujoco()
         if env_id.startswith("dm_control/"):
             return _make_dm_control(env_id, **kwargs)
+        if is_atari(env_id):
+            return make_atari(env_id.removeprefix("ale_py:"), **kwargs)
         spec = gym.registry.get(env_id)
         known = env_id if spec is None else dataclasses.replace(spec, order_enforce=False)  # always reset before a step
         return gym.make(known, disable_env_checker=True, **kwargs)
     except gym.error.UnregisteredEnv as error:
-        if env_id.startswith("ALE/") and not any(known.startswith("ALE/") for known in gym.registry):
-            raise UserError(
-                f"environment '{env_id}' needs ale-py: pip install ale-py, then give its id as ale_py:{env_id}"
-            ) from error
         raise _unknown(env_id, [known for known in gym.registry if not _successor(known)]) from error
     except (gym.error.DependencyNotInstalled, ImportError) as error:
         raise _not_installed(env_id, error) from error
@@ -38,6 +39,17 @@ def make_one(env_id: str, **kwargs: Any) -> gym.Env:
         if not kwargs or "argument" not in str(error):
             raise
         raise UserError(f"environment '{env_id}' cannot be made with these settings: {error}") from error
+
+
+def is_atari(env_id: Any) -> bool:
+    """Whether an id is that of an Atari game, ``ALE/Pong-v5``."""
+    return isinstance(env_id, str) and env_id.startswith(("ALE/", "ale_py:ALE/"))
+
+
+def rendered(env_id: str, size: int) -> dict[str, Any]:
+    """Keywords with which an environment renders arrays, MuJoCo's of this size."""
+    sized = not env_id.startswith(("dm_control/", "dmc:")) and "mujoco" in _entry_point(env_id)
+    return {"render_mode": "rgb_array", **({"width": size, "height": size} if sized else {})}
 
 
 def _not_installed(env_id: str, error: Exception) -> UserError:
