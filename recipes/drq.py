@@ -6,6 +6,7 @@ The defaults fit two cores; the paper's batches have 512 rows, with an update at
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torchrl.envs import EnvBase
@@ -86,9 +87,12 @@ def agent(args: Args, env: EnvBase) -> run.Agent:
     """Networks, temperature and loss: the critics' loss alone trains the convolutions."""
     encoder = modules.conv_encoder(env, features=args.features)
     own = modules.conv_encoder(env, features=args.features, shared=encoder, detach=True)
-    actor = modules.tanh_normal_actor(env, args.hidden, encoder=own)
+    layers = modules.mlp(args.features, None, args.hidden, torch.nn.ReLU)
+    actor = modules.tanh_normal_actor(env, encoder=torch.nn.Sequential(own, layers))
     critics = modules.q_value(env, 2, args.hidden, encoder=encoder)
-    temperature = controllers.Temperature(-float(env.action_spec_unbatched.shape.numel()), args.alpha_init)
+    spec: Any = env.action_spec_unbatched
+    unit = ((spec.space.high - spec.space.low) / 2).log().sum().item()  # of actions' densities, against [-1, 1]
+    temperature = controllers.Temperature(unit - spec.shape.numel(), args.alpha_init)
     loss = losses.SACLoss(actor, critics, temperature=temperature, gamma=args.gamma, augmented=True)
     return run.Agent(actor, loss, critics, controller=temperature)
 

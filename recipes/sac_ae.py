@@ -6,6 +6,7 @@ The defaults are the paper's, with half as many updates, which fits two cores.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torchrl.envs import EnvBase
@@ -88,9 +89,12 @@ def agent(args: Args, env: EnvBase) -> run.Agent:
     """Networks, temperature and losses: those of critics and reconstruction alone train the convolutions."""
     encoder = modules.conv_encoder(env, features=args.features)
     own = modules.conv_encoder(env, features=args.features, shared=encoder, detach=True)
-    actor = modules.tanh_normal_actor(env, args.hidden, encoder=own)
+    layers = modules.mlp(args.features, None, args.hidden, torch.nn.ReLU)
+    actor = modules.tanh_normal_actor(env, encoder=torch.nn.Sequential(own, layers))
     critics = modules.q_value(env, 2, args.hidden, encoder=encoder)
-    temperature = controllers.Temperature(-float(env.action_spec_unbatched.shape.numel()), args.alpha_init)
+    spec: Any = env.action_spec_unbatched
+    unit = ((spec.space.high - spec.space.low) / 2).log().sum().item()  # of actions' densities, against [-1, 1]
+    temperature = controllers.Temperature(unit - spec.shape.numel(), args.alpha_init)
     loss = losses.Sum(
         losses.SACLoss(actor, critics, temperature=temperature, gamma=args.gamma),
         losses.ReconstructionLoss(encoder, modules.decoder(encoder), latent_coeff=args.latent_coeff),

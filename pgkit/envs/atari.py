@@ -33,7 +33,7 @@ def make_atari(
         **kwargs: the game's: ``repeat_action_probability``, ``mode``, ``difficulty``, ``full_action_space``.
 
     Raises:
-        UserError: ``episodic_life=True``, or a package is missing.
+        UserError: ``episodic_life=True``, or a package or the game's ROM is missing.
     """
     if episodic_life:
         raise UserError(
@@ -49,7 +49,13 @@ def make_atari(
             "(pgkit's extra 'atari')"
         ) from error
     gym.register_envs(ale_py)
-    game = gym.make(env_id, frameskip=1, disable_env_checker=True, **kwargs)
+    try:
+        game = gym.make(env_id, frameskip=1, disable_env_checker=True, **kwargs)
+    except OSError as error:
+        raise UserError(
+            f"environment '{env_id}': its ROM cannot be read ({error}): install ale-py anew, which brings the ROMs, "
+            "and leave ALE_ROMS_DIR unset"
+        ) from error
     settings = {"noop_max": noop, "frame_skip": frameskip, "screen_size": screen_size, "grayscale_obs": grayscale}
     env = gym.wrappers.AtariPreprocessing(game, **settings)
     return env if grayscale else ChannelsFirst(env)

@@ -10,7 +10,7 @@ from typing import Any
 import gymnasium as gym
 
 from pgkit.envs.atari import make_atari
-from pgkit.envs.rendering import choose_backend
+from pgkit.envs.rendering import PACKAGES, choose_backend
 from pgkit.errors import UserError
 
 
@@ -62,6 +62,8 @@ def _not_installed(env_id: str, error: Exception) -> UserError:
     if newest := _successor(env_id):
         return UserError(f"environment '{env_id}' is one of Gymnasium's former ones: use {newest}")
     reason = str(error).splitlines()[0].rstrip(".")
+    if any(name in reason for name in ("EGL", "OSMesa", "OpenGL")):
+        return UserError(f"environment '{env_id}' cannot be rendered here ({reason}): {PACKAGES}")
     return UserError(
         f"environment '{env_id}' needs a package that is not installed ({reason}): pip install \"{_extra(env_id)}\""
     )
