@@ -1,4 +1,4 @@
-"""Exits with 0 where EGL can draw without a display. A process of its own: a probe in this one would spoil PyOpenGL's."""
+"""Exits with 0 where EGL can draw without a display; run in a process of its own, which a driver may end."""
 
 import ctypes
 import sys

@@ -95,7 +95,9 @@ def make(
             what = f"workers={workers}" if workers > 1 else f"{next(iter(kwargs))}=..."
             raise UserError(f"{what} with an environment that is made already: give a function that makes one")
         images = (pixels, stack, fast_render, clips)
-        return _adopt(env_id, num_envs, seed, Settings(device, action_repeat, flatten, info, max_episode_steps, *images))
+        return _adopt(
+            env_id, num_envs, seed, Settings(device, action_repeat, flatten, info, max_episode_steps, *images)
+        )
     num_envs = 1 if num_envs is None else num_envs
     if num_envs < 1 or workers < 1 or workers > num_envs:
         raise UserError(

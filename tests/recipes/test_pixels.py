@@ -8,7 +8,7 @@ import torch
 
 from pgkit import envs, modules, run
 from pgkit.cli import recipes
-from tests.recipes import stand_ins  # noqa: F401
+from tests.recipes import stand_ins
 from tests.recipes.test_ppo import pgkit, rows
 
 OFF_POLICY = ("--random-frames", 40, "--batch-size", 16, "--log-every", 32, "--hidden", 16, "--save-buffer")
