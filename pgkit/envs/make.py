@@ -203,8 +203,8 @@ def _simulator(env: EnvBase | GymVectorEnv, seed: int, first: int, settings: Set
     }
     if what := [name for name, given in single.items() if given]:
         raise UserError(
-            f"{what[0]}= is for single Gymnasium environments, this is a {type(env).__name__}: use one of its library's "
-            "wrappers (TorchRL: StepCounter(max_steps=...), FrameSkipTransform(...))"
+            f"{what[0]}= is for single Gymnasium environments, this is a {type(env).__name__}: use one of its "
+            "library's wrappers (TorchRL: StepCounter(max_steps=...), FrameSkipTransform(...))"
         )
     if isinstance(env, GymVectorEnv):
         return GymnasiumVector(env, seed, first, settings.flatten, settings.info)

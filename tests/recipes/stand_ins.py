@@ -5,7 +5,7 @@ import numpy as np
 
 
 class Bar(gym.Env):
-    """Twelve steps; the first observation depends on the seed. Gray ``[1, size, size]``, or as Atari ``[size, size]``."""
+    """Twelve steps; the first observation depends on the seed. Gray images ``[1, size, size]``."""
 
     def __init__(self, size=20, discrete=False, render_mode=None, scale=1.0):
         self.size, self.discrete, self.render_mode, self.scale = size, discrete, render_mode, scale
@@ -35,4 +35,3 @@ class Bar(gym.Env):
 
 gym.register("Bar-v0", entry_point=Bar)
 gym.register("DiscreteBar-v0", entry_point=Bar, kwargs={"discrete": True, "size": 36})
-gym.register("ALEBar-v0", entry_point=Bar, kwargs={"discrete": True, "size": 84, "scale": 5.0})
