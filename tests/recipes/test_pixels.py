@@ -55,8 +55,9 @@ def test_compiled_in_one_graph_it_equals_the_eager_run(tmp_path, name):
     ],
 )
 def test_images_with_discrete_actions(tmp_path, name, flags):
-    train(name, tmp_path / "a", *flags, env_id="DiscreteBar-v0")
-    train(name, tmp_path / "b", *flags, "--workers", 2, env_id="DiscreteBar-v0")
+    env_id = "tests.recipes.stand_ins:DiscreteBar-v0"
+    train(name, tmp_path / "a", *flags, env_id=env_id)
+    train(name, tmp_path / "b", *flags, "--workers", 2, env_id=env_id)
     assert rows(tmp_path / "a") == rows(tmp_path / "b")  # one process or two
     assert rows(tmp_path / "a")[-1]["train/grad_norm"]
     policy = run.load_policy(tmp_path / "a", trust=True)
@@ -101,9 +102,10 @@ def test_the_actors_losses_leave_the_convolutions_as_they_are(name):
 
 
 def test_the_recipes_say_what_they_cannot_read(tmp_path):
-    error = continuous("drq", tmp_path / "a", "--pixels", 0, env_id="Pendulum-v1", ok=False).stderr
+    error = continuous("drq", tmp_path / "a", env_id="Pendulum-v1", ok=False).stderr
     assert "no image" in error
-    error = continuous("drq", tmp_path / "b", "--frame-stack", 3, "--buffer-size", 2, ok=False).stderr
+    own = ("--pixels", 0, "--action-repeat", 1, "--frame-stack", 3, "--buffer-size", 2)
+    error = train("drq", tmp_path / "b", *own, *OFF_POLICY, ok=False).stderr
     assert "a stack of 3 frames ('observation') is longer than the 2 steps" in error
     shown = envs.make(lambda: stand_ins.Bar(size=40, render_mode="rgb_array"), pixels=20, frame_stack=2)
     assert modules.conv_encoder(shown).shape == (6, 20, 20)
