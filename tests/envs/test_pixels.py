@@ -207,7 +207,7 @@ def test_copies_have_shifts_of_their_own_and_the_loss_averages_over_them():
     encoder = modules.conv_encoder(env)
     own = modules.conv_encoder(env, shared=encoder, detach=True)
     critic = modules.q_value(env, 1, (4,), encoder=encoder)
-    settings = {"delay_actor": False, "delay_qvalue": False, "augmented": True}
+    settings = {"delay_actor": False, "delay_value": False, "augmented": True}
     loss = losses.DDPGLoss(modules.deterministic_actor(env, encoder=own), critic, **settings)
     row = env.rollout(1).squeeze(0)
     same = loss(modules.random_shift(0, copies=3)(row))
