@@ -22,7 +22,7 @@ class Args(run.RunArgs):
     """Settings of discrete SAC."""
 
     env_id: str = "CartPole-v1"
-    """Gymnasium id of an environment with discrete actions."""
+    """Gymnasium id of an environment with one discrete action, or ALE/<game>-v5."""
     total_frames: int = 1_000_000
     """Env steps to train for, all envs together."""
     num_envs: int = 1
@@ -72,7 +72,7 @@ class Args(run.RunArgs):
     save_buffer: bool = run.setting(False, on_resume=True)
     """Save the replay buffer beside each checkpoint, so that a resumed run goes on bit for bit."""
     hidden: tuple[int, ...] = run.setting((256, 256), low=1, high=2**16)
-    """Sizes of the hidden layers, of actor and critics alike."""
+    """Sizes of the hidden layers, of actor and critics alike; of images, after one encoder."""
     log_every: int = run.setting(1_000, low=1, on_resume=True)
     """A row of metrics every so many frames."""
 
@@ -83,13 +83,22 @@ PRESETS = {
         learning_rate=1e-3, q_learning_rate=1e-3, alpha_learning_rate=1e-3, target_entropy_weight=0.2, tau=0.05,
         buffer_size=100_000,
     ),
+    "ALE/*": dict(
+        total_frames=1_000_000, eval_every=100_000, eval_episodes=5, num_envs=4, random_frames=20_000, batch_size=64,
+        updates_per_step=0.25, buffer_size=300_000, hidden=(), target_entropy_weight=0.5,
+    ),
 }  # fmt: skip
 
 
 def agent(args: Args, env: EnvBase) -> run.Agent:
     """Networks, temperature and loss."""
-    actor = modules.categorical_actor(env, args.hidden, torch.nn.ReLU)
-    critics = modules.discrete_q_value(env, num_critics=2, hidden=args.hidden)
+    image = modules.image_encoder(env)  # the critics', whose loss alone trains it
+    own = None
+    if image is not None:
+        layers = modules.mlp(image.features, None, args.hidden, torch.nn.ReLU)
+        own = torch.nn.Sequential(modules.Detached(image), layers)
+    actor = modules.categorical_actor(env, args.hidden, torch.nn.ReLU, encoder=own)
+    critics = modules.discrete_q_value(env, num_critics=2, hidden=args.hidden, encoder=image)
     if args.alpha is not None:
         temperature = controllers.FixedTemperature(args.alpha)
     else:
@@ -120,8 +129,10 @@ def main(args: Args) -> None:
             sampler=data.Prioritized() if args.replay == "prioritized" else None,
             storage=data.in_files(args.buffer_dir) if args.buffer_dir else LazyTensorStorage,
         )
+        of_critics = {id(p) for p in built.critic.parameters()}  # an encoder is theirs
+        of_actor = [p for p in built.actor.parameters() if id(p) not in of_critics]
         groups = [
-            {"params": list(built.actor.parameters()), "lr": args.learning_rate},
+            {"params": of_actor, "lr": args.learning_rate},
             {"params": list(built.critic.parameters()), "lr": args.q_learning_rate},
             {"params": list(built.controller.parameters()), "lr": args.alpha_learning_rate},
         ]

@@ -1,7 +1,7 @@
 """Deep Q-learning with a double target and annealed epsilon-greedy exploration, for discrete actions.
 
-The loss is TorchRL's DQNLoss as it is; replay, collector and compiled update are pgkit's. Tuned values for CartPole are
-in ``PRESETS`` below.
+The loss is TorchRL's DQNLoss as it is; replay, collector and compiled update are pgkit's. Values for CartPole and Atari
+are in ``PRESETS`` below.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class Args(run.RunArgs):
     """Settings of DQN."""
 
     env_id: str = "CartPole-v1"
-    """Gymnasium id with one discrete action."""
+    """Gymnasium id with one discrete action, or ALE/<game>-v5."""
     num_envs: int = 4
     """Envs stepped side by side."""
     steps: int = run.setting(1, low=1)
@@ -60,12 +60,18 @@ class Args(run.RunArgs):
     save_buffer: bool = run.setting(False, on_resume=True)
     """Save the replay buffer beside each checkpoint, so that a resumed run goes on bit for bit."""
     hidden: tuple[int, ...] = run.setting((128, 128), low=1, high=2**16)
-    """Sizes of the hidden layers."""
+    """Sizes of the hidden layers; of images, after an encoder."""
     log_every: int = run.setting(1_000, low=1, on_resume=True)
     """A row of metrics every so many frames."""
 
 
-PRESETS = {"CartPole-*": dict(total_frames=100_000, eval_every=10_000, n_step=10, batch_size=256, tau=0.01)}
+PRESETS = {
+    "CartPole-*": dict(total_frames=100_000, eval_every=10_000, n_step=10, batch_size=256, tau=0.01),
+    "ALE/*": dict(
+        total_frames=10_000_000, eval_every=500_000, eval_episodes=5, random_frames=80_000, batch_size=32,
+        learning_rate=1e-4, buffer_size=1_000_000, epsilon_end=0.01, epsilon_frames=1_000_000, hidden=(),
+    ),
+}  # fmt: skip
 
 
 def agent(args: Args, env: EnvBase) -> run.Agent:
@@ -73,11 +79,12 @@ def agent(args: Args, env: EnvBase) -> run.Agent:
     actions = getattr(env.action_spec_unbatched.space, "n", None)
     if actions is None:
         raise UserError(f"dqn needs one discrete action, '{args.env_id}' has another action space: use sac or td3")
-    shape = env.observation_spec_unbatched["observation"].shape
-    if len(shape) != 1:
-        raise UserError(f"dqn reads vectors, an observation of '{args.env_id}' is {list(shape)}: flatten it")
-    sizes = (shape[0], actions)
+    shape, image = env.observation_spec_unbatched["observation"].shape, modules.image_encoder(env)
+    if len(shape) != 1 and image is None:
+        raise UserError(f"dqn reads vectors and images, an observation of '{args.env_id}' is {list(shape)}: flatten it")
+    sizes = (shape[0] if image is None else image.features, actions)
     net = modules.mlp(*sizes, args.hidden, torch.nn.ReLU)
+    net = net if image is None else torch.nn.Sequential(image, net)
     actor = QValueActor(net, in_keys=["observation"], action_space="categorical")
     settings = {"loss_function": args.loss_function, "double_dqn": args.double}
     loss = DQNLoss(actor, action_space="categorical", delay_value=True, **settings)

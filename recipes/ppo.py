@@ -19,7 +19,7 @@ class Args(run.RunArgs):
     """Settings of PPO."""
 
     env_id: str = "HalfCheetah-v5"
-    """Gymnasium id, or dm_control/<domain>-<task>-v0."""
+    """Gymnasium id, dm_control/<domain>-<task>-v0, or ALE/<game>-v5."""
     total_frames: int = 1_000_000
     """Env steps to train for, all envs together."""
     eval_every: int = 100_000
@@ -51,13 +51,13 @@ class Args(run.RunArgs):
     recompute_advantage: bool = True
     """Estimate the advantage again before each epoch, with the critic as it is then."""
     normalize_obs: bool = True
-    """Normalize observations by their running mean and deviation."""
+    """Normalize observations by their running mean and deviation; images are divided by 255 instead."""
     scale_returns: bool = True
     """Let the critic learn returns divided by their running deviation; rewards stay as they are."""
     target_kl: float | None = run.setting(None, low=0)
     """Stop an update after the epoch whose KL divergence exceeds 1.5 times this."""
     hidden: tuple[int, ...] = run.setting((64, 64), low=1, high=2**16)
-    """Sizes of the hidden layers, of actor and critic alike."""
+    """Sizes of the hidden layers, of actor and critic alike; images have one encoder for both."""
     log_std: float = -0.5
     """Initial log standard deviation of a continuous policy."""
     recurrent: Literal["none", "gru", "lstm"] = "none"
@@ -84,6 +84,11 @@ PRESETS = {
         total_frames=50_000, eval_every=10_000, steps=128, minibatch_size=256, learning_rate=1e-3, anneal=True,
         entropy_coeff=0.01, normalize_advantage="off", normalize_obs=False, scale_returns=False, critic_coeff=0.5,
     ),
+    "ALE/*": dict(
+        total_frames=10_000_000, eval_every=500_000, eval_episodes=5, steps=128, epochs=4, minibatch_size=256,
+        learning_rate=2.5e-4, anneal=True, clip_epsilon=0.1, entropy_coeff=0.01, critic_coeff=0.5,
+        normalize_advantage="minibatch", recompute_advantage=False, scale_returns=False,
+    ),
     "HalfCheetah-*": dict(lmbda=0.9),
     "Hopper-*": dict(learning_rate=2e-4, anneal=True),
     "dm_control/*": dict(),
@@ -93,10 +98,11 @@ PRESETS = {
 
 def agent(args: Args, env: EnvBase) -> run.Agent:
     """Networks, loss and advantage."""
-    normalizer = modules.ObsNormalizer(env) if args.normalize_obs else None
+    image = modules.image_encoder(env)
+    normalizer = modules.ObsNormalizer(env) if args.normalize_obs and image is None else None
     scale = modules.ReturnScale() if args.scale_returns else None
 
-    parts = {"hidden": args.hidden, "normalizer": normalizer}
+    parts = {"hidden": args.hidden, "normalizer": normalizer} if image is None else {"encoder": image}
     if args.recurrent != "none":
         core = modules.gru if args.recurrent == "gru" else modules.lstm
         parts = {"encoder": core(env, args.memory_size, **parts)}

@@ -34,6 +34,7 @@ class Gymnasium:
         first: index of the first one, where this is a share of a larger vector.
         flatten: False keeps the entries of a Dict observation apart.
         info: entries of ``info`` that a step gives.
+        clip_rewards: a step's reward is clipped to [-1, 1]; the episode's counts as it is.
     """
 
     device = torch.device("cpu")
@@ -41,11 +42,17 @@ class Gymnasium:
     masks = False
 
     def __init__(
-        self, envs: Sequence[gym.Env], seed: int = 0, first: int = 0, flatten: bool = True, info: Info = ()
+        self,
+        envs: Sequence[gym.Env],
+        seed: int = 0,
+        first: int = 0,
+        flatten: bool = True,
+        info: Info = (),
+        clip_rewards: bool = False,
     ) -> None:
         if len({id(env.unwrapped) for env in envs}) < len(envs):
             raise UserError("the function that makes an environment gave the same one twice: it must make a new one")
-        self.envs, self.num_envs, self.first = envs, len(envs), first
+        self.envs, self.num_envs, self.first, self.clip_rewards = envs, len(envs), first, clip_rewards
         entries = spaces.observation_entries(envs[0].observation_space, flatten)
         self.to_env = spaces.to_env(envs[0].action_space)
         n = self.num_envs
@@ -126,6 +133,8 @@ class Gymnasium:
         self._taken.append(actions)
         self._stepped = True
         totals.count()
+        if self.clip_rewards:
+            np.clip(totals.reward, -1.0, 1.0, out=totals.reward)
         self._fresh.copy_from(self._next)
         done = totals.terminated | totals.truncated
         if done.any():

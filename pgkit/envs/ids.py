@@ -11,6 +11,8 @@ from typing import Any
 
 import gymnasium as gym
 
+from pgkit.envs.atari import make_atari
+from pgkit.envs.rendering import PACKAGES, choose_backend
 from pgkit.errors import UserError
 
 
@@ -25,17 +27,16 @@ def make_one(env_id: str, **kwargs: Any) -> Any:
         if colon and name.isidentifier() and name in (found := vars(importlib.import_module(module))):
             return found[name](**kwargs)
         if "mujoco" in _entry_point(env_id):
+            choose_backend()
             _hear_mujoco()
         if env_id.startswith("dm_control/"):
             return _make_dm_control(env_id, **kwargs)
+        if is_atari(env_id):
+            return make_atari(env_id.removeprefix("ale_py:"), **kwargs)
         spec = gym.registry.get(env_id)
         known = env_id if spec is None else dataclasses.replace(spec, order_enforce=False)  # always reset before a step
         return gym.make(known, disable_env_checker=True, **kwargs)
     except gym.error.UnregisteredEnv as error:
-        if env_id.startswith("ALE/") and not any(known.startswith("ALE/") for known in gym.registry):
-            raise UserError(
-                f"environment '{env_id}' needs ale-py: pip install ale-py, then give its id as ale_py:{env_id}"
-            ) from error
         raise _unknown(env_id, [known for known in gym.registry if not _successor(known)]) from error
     except (gym.error.DependencyNotInstalled, ImportError) as error:
         raise _not_installed(env_id, error) from error
@@ -59,6 +60,17 @@ def _make_mpe2(env_id: str, max_episode_steps: int | None = None, **kwargs: Any)
     return importlib.import_module(f"mpe2.{name}").parallel_env(**limit, **kwargs)
 
 
+def is_atari(env_id: Any) -> bool:
+    """Whether an id is that of an Atari game, ``ALE/Pong-v5``."""
+    return isinstance(env_id, str) and env_id.startswith(("ALE/", "ale_py:ALE/"))
+
+
+def rendered(env_id: str, size: int) -> dict[str, Any]:
+    """Keywords with which an environment renders arrays, MuJoCo's of this size."""
+    sized = not env_id.startswith(("dm_control/", "dmc:")) and "mujoco" in _entry_point(env_id)
+    return {"render_mode": "rgb_array", **({"width": size, "height": size} if sized else {})}
+
+
 def _not_installed(env_id: str, error: Exception) -> UserError:
     module, colon, _ = env_id.partition(":")
     cause = error.__cause__ or error
@@ -69,6 +81,8 @@ def _not_installed(env_id: str, error: Exception) -> UserError:
     if newest := _successor(env_id):
         return UserError(f"environment '{env_id}' is one of Gymnasium's former ones: use {newest}")
     reason = str(error).splitlines()[0].rstrip(".")
+    if any(name in reason for name in ("EGL", "OSMesa", "OpenGL")):
+        return UserError(f"environment '{env_id}' cannot be rendered here ({reason}): {PACKAGES}")
     return UserError(
         f"environment '{env_id}' needs a package that is not installed ({reason}): pip install \"{_extra(env_id)}\""
     )
@@ -124,7 +138,7 @@ def _unknown(env_id: str, known: list[str]) -> UserError:
 
 def _extra(env_id: str) -> str:
     if env_id.startswith("mpe2/"):
-        return "pgkit[agents]"
+        return "pgkit-rl[agents]"
     if env_id.startswith("dm_control/"):
         return "shimmy[dm-control]"
     entry = _entry_point(env_id)

@@ -18,9 +18,10 @@ from pgkit.envs.action_repeat import ActionRepeat
 from pgkit.envs.agents import Names
 from pgkit.envs.gym_list import Gymnasium
 from pgkit.envs.gym_vector import GymnasiumVector
-from pgkit.envs.ids import make_one
+from pgkit.envs.ids import is_atari, make_one, rendered
 from pgkit.envs.numpy_entries import Info
 from pgkit.envs.parallel import Parallel, is_parallel, refuse_turns
+from pgkit.envs.pixels import FrameStack, Pixels
 from pgkit.envs.seeding import episode_seed
 from pgkit.envs.torch_batch import Torch
 from pgkit.envs.vector import VectorEnv
@@ -37,6 +38,10 @@ class Settings(NamedTuple):
     flatten: bool = True
     info: Info = ()
     time_limit: int | None = None
+    pixels: int | None = None
+    frame_stack: int = 1
+    fast_render: bool = False
+    reward_clipping: bool = False
     groups: Names | None = None
 
 
@@ -51,6 +56,10 @@ def make(
     flatten: bool = True,
     info: Info = (),
     max_episode_steps: int | None = None,
+    pixels: int | None = None,
+    frame_stack: int | None = None,
+    fast_render: bool = False,
+    reward_clipping: bool | None = None,
     groups: Names | None = None,
     **kwargs: Any,
 ) -> VectorEnv:
@@ -85,12 +94,16 @@ def make(
     if seed is None:
         raise UserError("seed=None: give a whole number; numpy.random.randint(2**31) is another in every run")
     check_whole_number(0, seed=seed, num_envs=num_envs, workers=workers)
-    check_whole_number(1, action_repeat=action_repeat)
+    check_whole_number(1, action_repeat=action_repeat, pixels=pixels, frame_stack=frame_stack)
+    atari = is_atari(env_id)
+    stack = (4 if atari else 1) if frame_stack is None else frame_stack
+    clips = atari if reward_clipping is None else reward_clipping
     if isinstance(env_id, EnvBase | GymVectorEnv):
         if workers > 1 or kwargs:
             what = f"workers={workers}" if workers > 1 else f"{next(iter(kwargs))}=..."
             raise UserError(f"{what} with an environment that is made already: give a function that makes one")
-        given = Settings(device, action_repeat, flatten, info, max_episode_steps, groups)
+        images = (pixels, stack, fast_render, clips)
+        given = Settings(device, action_repeat, flatten, info, max_episode_steps, *images, groups)
         return _adopt(env_id, num_envs, seed, given)
     num_envs = 1 if num_envs is None else num_envs
     if num_envs < 1 or workers < 1 or workers > num_envs:
@@ -101,12 +114,19 @@ def make(
     limited = isinstance(env_id, str) and not env_id.startswith(("dm_control/", "dmc:"))  # by Gymnasium
     if limited and max_episode_steps is not None:
         kwargs["max_episode_steps"] = max_episode_steps
-    settings = Settings(device, action_repeat, flatten, info, None if limited else max_episode_steps, groups)
+    if atari:
+        kwargs |= {} if pixels is None else {"screen_size": pixels}
+    elif isinstance(env_id, str) and pixels is not None:
+        kwargs = rendered(env_id, pixels) | kwargs
+    images = (None if atari else pixels, stack, fast_render, clips)
+    settings = Settings(device, action_repeat, flatten, info, None if limited else max_episode_steps, *images, groups)
     function = _function(env_id, kwargs)
     env = VectorEnv(partial(_share, function, settings), num_envs, seed, workers)
     env.env_id = env_id if isinstance(env_id, str) else getattr(env_id, "__qualname__", type(env_id).__name__)
     if action_repeat > 1:
         env.env_id += f" (action repeat {action_repeat})"
+    if stack > 1:
+        env.frame_stack = stack
     return env
 
 
@@ -176,7 +196,7 @@ def _share(function: Callable[..., Any], settings: Settings, first: int, count: 
         raise UserError(f"groups= is for environments with many agents, {type(made).__name__} has one: leave it out")
     _warn_of_statistics(made)
     envs = [_one(env, settings) for env in (made, *rest)]
-    return Gymnasium(envs, seed, first, settings.flatten, settings.info)
+    return Gymnasium(envs, seed, first, settings.flatten, settings.info, settings.reward_clipping)
 
 
 def _named(function: Any) -> set[str]:
@@ -204,11 +224,17 @@ def _only_for_single(settings: Settings, env: Any) -> None:
 
 
 def _simulator(env: EnvBase | GymVectorEnv, seed: int, first: int, settings: Settings) -> Simulator:
-    if settings.action_repeat > 1 or settings.time_limit is not None:
-        what = "action_repeat" if settings.action_repeat > 1 else "max_episode_steps"
+    single = {
+        "action_repeat": settings.action_repeat > 1,
+        "max_episode_steps": settings.time_limit is not None,
+        "pixels": settings.pixels is not None,
+        "frame_stack": settings.frame_stack > 1,
+        "reward_clipping": settings.reward_clipping,
+    }
+    if what := [name for name, given in single.items() if given]:
         raise UserError(
-            f"{what}= is for single Gymnasium environments, this is a {type(env).__name__}: use one of its library's "
-            "wrappers (TorchRL: StepCounter(max_steps=...), FrameSkipTransform(...))"
+            f"{what[0]}= is for single Gymnasium environments, this is a {type(env).__name__}: use one of its "
+            "library's wrappers (TorchRL: StepCounter(max_steps=...), FrameSkipTransform(...))"
         )
     if isinstance(env, GymVectorEnv):
         return GymnasiumVector(env, seed, first, settings.flatten, settings.info)
@@ -233,7 +259,7 @@ def _one(env: Any, settings: Settings) -> gym.Env:
     if dm_env is not None and isinstance(env, dm_env.Environment):
         from shimmy.dm_control_compatibility import DmControlCompatibilityV0
 
-        env = DmControlCompatibilityV0(env)
+        env = DmControlCompatibilityV0(env, render_mode=None if settings.pixels is None else "rgb_array")
     if not isinstance(env, gym.Env):
         raise UserError(
             f"the function that makes an environment made a {type(env).__name__}: it must make a gym.Env, a "
@@ -241,4 +267,9 @@ def _one(env: Any, settings: Settings) -> gym.Env:
         )
     if settings.time_limit is not None:
         env = gym.wrappers.TimeLimit(env, settings.time_limit)
-    return ActionRepeat(env, settings.action_repeat) if settings.action_repeat > 1 else env
+    env = ActionRepeat(env, settings.action_repeat) if settings.action_repeat > 1 else env
+    if settings.pixels is not None:
+        env = Pixels(env, settings.pixels, settings.fast_render)
+    elif settings.fast_render:
+        raise UserError("fast_render=True is how pixels= are drawn: give pixels=84, or leave it out")
+    return FrameStack(env, settings.frame_stack) if settings.frame_stack > 1 else env

@@ -239,7 +239,7 @@ def _vmas(scenario: Any) -> tuple[Any, _Stream]:
         import vmas
         from vmas.simulator.environment import Environment
     except ImportError as error:
-        raise UserError(f'vmas/{scenario} needs VMAS ({error}): pip install "pgkit[agents]"') from error
+        raise UserError(f'vmas/{scenario} needs VMAS ({error}): pip install "pgkit-rl[agents]"') from error
     known = [*vmas.scenarios, *vmas.debug_scenarios, *vmas.mpe_scenarios]
     if isinstance(scenario, str) and scenario not in known:
         nearest = ", ".join(f"vmas/{x}" for x in difflib.get_close_matches(scenario, known, cutoff=0.4) or known)

@@ -10,6 +10,7 @@ from pgkit.losses.grpo import GRPOLoss
 from pgkit.losses.kl_pen_ppo import KLPENPPOLoss
 from pgkit.losses.policy_base import ActorCriticLoss, PolicyLoss
 from pgkit.losses.q_base import QLoss
+from pgkit.losses.reconstruction import ReconstructionLoss
 from pgkit.losses.redq import REDQLoss
 from pgkit.losses.reinforce import ReinforceLoss
 from pgkit.losses.sac import SACLoss
@@ -33,6 +34,7 @@ __all__ = [
     "PolicyLoss",
     "QLoss",
     "REDQLoss",
+    "ReconstructionLoss",
     "ReinforceLoss",
     "SACLoss",
     "SFTLoss",

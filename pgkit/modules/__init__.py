@@ -4,7 +4,7 @@ from pgkit.modules.actors import actor, gaussian_actor, tanh_normal_actor
 from pgkit.modules.augmentations import random_shift
 from pgkit.modules.bodies import Encoder, batch_renorm_mlp, ensemble_mlp, simba
 from pgkit.modules.causal_lm import causal_lm, token_value
-from pgkit.modules.convolutions import ConvEncoder, Detached, conv_encoder, decoder
+from pgkit.modules.convolutions import ConvEncoder, Detached, conv_encoder, decoder, image_encoder
 from pgkit.modules.deterministic import deterministic_actor
 from pgkit.modules.discrete import categorical_actor
 from pgkit.modules.encoders import dict_encoder
@@ -49,6 +49,7 @@ __all__ = [
     "gru",
     "hugging_face",
     "hugging_face_tokenizer",
+    "image_encoder",
     "lstm",
     "mlp",
     "q_value",

@@ -86,6 +86,20 @@ def conv_encoder(
     return encoder
 
 
+def image_encoder(env: Any, device: torch.device | str | None = None) -> ConvEncoder | None:
+    """Atari's encoder where the observation is an image of bytes (``small`` where that is too small), else None.
+
+    Args:
+        env: its specs say which.
+        device: as in :func:`conv_encoder`.
+    """
+    spec = env.observation_spec_unbatched
+    if "observation" not in spec.keys() or spec["observation"].ndim < 3 or spec["observation"].dtype != torch.uint8:
+        return None
+    least = min(spec["observation"].shape[-2:])
+    return conv_encoder(env, "nature" if least >= _least("nature") else None, device=device)
+
+
 class ConvEncoder(nn.Module):
     """What :func:`conv_encoder` makes."""
 

@@ -53,7 +53,8 @@ class OffPolicyUpdate:
         batch_size: rows of a batch.
         updates_per_step: gradient steps for each frame collected; a fraction such as 0.5 adds up.
         actor_delay: the losses other than the critics' join every so many steps (2 in TD3). The critics' are
-            ``loss_qvalue``, ``loss_value``, ``loss_critic``, and what trains nothing but their parameters.
+            ``loss_qvalue``, ``loss_value``, ``loss_critic``, ``loss_reconstruction``, and what trains nothing but their
+            parameters.
         delay_targets: the target networks move only in the steps in which those other losses join, as in TD3.
         tau: share of the trained parameters that the targets take over at each step; or shares by the names of networks
             and of modules in them, ``{"qvalue_network": 0.01, "encoder": 0.05}``, of which the innermost holds.
@@ -230,7 +231,8 @@ class OffPolicyUpdate:
             for key in [key for key in out.keys() if is_loss(key) and out[key].requires_grad]:
                 grads = torch.autograd.grad(out[key].sum(), params, allow_unused=True, retain_graph=True)
                 reached[key] = [p for p, grad in zip(params, grads, strict=True) if grad is not None]
-            named = [key for key in ("loss_qvalue", "loss_value", "loss_critic") if key in reached]
+            names = ("loss_qvalue", "loss_value", "loss_critic", "loss_reconstruction")
+            named = [key for key in names if key in reached]
             critics = {id(p) for key in named for p in reached[key]}
             return {key: held for key, held in reached.items() if held and all(id(p) in critics for p in held)}
 

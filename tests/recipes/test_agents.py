@@ -17,7 +17,7 @@ from pgkit.errors import UserError
 from pgkit.run.args import told
 from tests.recipes.test_ppo import pgkit, rows
 
-DISCRETE = ("dqn", "rainbow", "discrete_sac")
+DISCRETE, PIXELS = ("dqn", "rainbow", "discrete_sac"), ("drq", "sac_ae")
 KINDS = [
     *((name, {}) for name in recipes.names() if name not in ("grpo", "mappo")),  # whose environments are others
     ("ppo", {"recurrent": "gru"}),
@@ -35,7 +35,7 @@ def same_path(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(("name", "settings"), KINDS)
 def test_an_agent_is_built_again_and_loaded(tmp_path: Path, name: str, settings: dict[str, Any]):
     recipe = recipes.load(recipes.find(name))
-    env_id = "CartPole-v1" if name in DISCRETE else "Pendulum-v1"
+    env_id = "CartPole-v1" if name in DISCRETE else "InvertedPendulum-v5" if name in PIXELS else "Pendulum-v1"
     args = recipe.Args(env_id=env_id, hidden=(8, 8), **settings)
     env = args.make_env(num_envs=3, seed=1)
     trained, fresh = recipe.agent(args, env), recipe.agent(args, env)
@@ -63,10 +63,16 @@ class Picture(gym.Env):
     observation_space, action_space = gym.spaces.Box(0, 255, (96, 96, 3), np.uint8), gym.spaces.Discrete(2)
 
 
-@pytest.mark.parametrize("name", ["dqn", "rainbow"])
-def test_a_picture_is_no_vector(name: str):
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("dqn", r"\(96, 96, 3\), its channels come last"),
+        ("rainbow", r"rainbow reads vectors, an observation of 'CartPole-v1' is \[96, 96, 3\]"),
+    ],
+)
+def test_a_picture_that_cannot_be_read(name: str, said: str):
     recipe = recipes.load(recipes.find(name))
-    with pytest.raises(UserError, match=rf"{name} reads vectors, an observation of 'CartPole-v1' is \[96, 96, 3\]"):
+    with pytest.raises(UserError, match=said):
         recipe.agent(recipe.Args(), envs.make(Picture))
 
 
