@@ -26,7 +26,7 @@ def prioritized(buffer: Any) -> bool:
 
 def transforms(buffer: Any) -> dict[str, Any]:
     """Its transforms by a name for a message; one of several steps has a ``gamma`` of its own."""
-    held = buffer.transform if isinstance(buffer, ReplayBuffer) else ()
+    held: Any = buffer.transform if isinstance(buffer, ReplayBuffer) else ()
     return {f"{name_of(transform)} of {name_of(buffer)}": transform for transform in held}
 
 

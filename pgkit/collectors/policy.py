@@ -21,7 +21,7 @@ from pgkit.compiled import Compiled, Mode, compiled, undone
 from pgkit.envs.seeding import episode_seed
 from pgkit.seams import Entries, Key
 
-Act = Callable[..., tuple[Tensor, ...]]
+Act = Callable[..., Sequence[Tensor]]
 LEAST_ROWS = 4  # matrix products and convolutions of fewer rows round differently
 
 
@@ -169,7 +169,7 @@ def trace(act: Act, inputs: Sequence[Tensor], actor: TensorDictModuleBase, mode:
 def native_policy(act: Act, inputs: Sequence[Tensor], actor: TensorDictModuleBase, mode: Mode) -> Compiled:
     """The function behind the door to native code, not bound yet; see :func:`trace`."""
 
-    def function(_: None, *inputs: Tensor) -> tuple[Tensor, ...]:
+    def function(_: None, *inputs: Tensor) -> Sequence[Tensor]:
         return act(*inputs)
 
     def others(_: None, *inputs: Tensor) -> list[tuple[Any, ...]]:

@@ -25,7 +25,8 @@ def allocate(steps: int, env: VectorEnv, outputs: Entries) -> Entries:
     """Buffers ``[steps, N, ...]`` for a rollout, from the specs and from examples ``[N, ...]`` of the outputs."""
     made: dict[Any, Any] = {**dict(_specs(env.observation_spec)), **outputs}
     for key in filter(is_state, outputs):
-        flag, path = torch.zeros(env.num_envs, 1, dtype=torch.bool, device=env.device), path_of(key)[1:]
+        flag = torch.zeros(env.num_envs, 1, dtype=torch.bool, device=env.device)
+        path: Any = path_of(key)[1:]
         made |= {path if len(path) > 1 else path[0]: outputs[key], "is_init": flag, ("next", "is_init"): flag}
     made |= {("next", *_path(key)): x for key, x in [*_specs(env.observation_spec), *_specs(env.info_spec)]}
     for key, spec in _specs(env.full_reward_spec):

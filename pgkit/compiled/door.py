@@ -120,6 +120,7 @@ class Compiled:
         if self.mode != "record":
             getLogger("pgkit").info("compiling %s, once: up to 40 seconds, less when it is in the cache", self.name)
         failed: list[str] = []
+        last: Exception | None = None
         for rung in _LADDERS[self.mode]:
             if rung == TRACED and self.most is not None:
                 continue

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from logging import getLogger
-from typing import Any
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDictBase
@@ -53,7 +53,7 @@ class Recorder:
 
         def flat(*tensors: Tensor) -> list[Tensor]:
             given, rest = tensors[: len(held)], tensors[len(held) :]
-            rows = None if data is None else data.copy()  # of nested TensorDicts too: ``data`` stays as it is
+            rows: Any = None if data is None else data.copy()  # of nested TensorDicts too: ``data`` stays as it is
             for key, leaf in zip(self.keys, rest, strict=False):
                 rows.set(key, leaf)
             before = [tensor.detach().clone() for tensor in given]
@@ -123,7 +123,7 @@ def recorded(
 
     def bind(data: TensorDictBase | None) -> Function:
         if not decisions:
-            return partial(graph, *recorder.leaves(data))
+            return cast(Function, partial(graph, *recorder.leaves(data)))
         return partial(_by_decisions, recorder, graphs, data)
 
     return bind

@@ -27,7 +27,7 @@ class Task(Protocol):
     completion_length: int
     rewards: Mapping[str, Reward]
 
-    def prompt(self, random: Random) -> str: ...
+    def prompt(self, random: Random, /) -> str: ...
 
 
 class Taught(Task, Protocol):

@@ -21,7 +21,7 @@ from pgkit.envs.tokenizers import Characters, Tokenizer
 from pgkit.errors import UserError, check_whole_number
 from pgkit.seams import Entries, Step
 
-TASKS: dict[str, Callable[[], Task]] = {"addition": Addition, "sorting": Sorting, "countdown": Countdown}
+TASKS: dict[str, Callable[[], Any]] = {"addition": Addition, "sorting": Sorting, "countdown": Countdown}
 
 
 def prompts(

@@ -52,7 +52,7 @@ class DDPGLoss(QLoss):
         loss_function: str = "l2",
         delay_actor: bool = True,
         delay_value: bool = True,
-        **settings: Unpack[QSettings],
+        **settings: Unpack[QSettings],  # pyright: ignore[reportGeneralTypeIssues]
     ) -> None:
         super().__init__(
             actor_network,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, TypedDict, TypeVar
+from typing import Any, TypedDict, TypeVar, cast
 
 import torch
 from tensordict import TensorDictBase
@@ -167,7 +167,8 @@ class QLoss(Loss):
                 out = self.qvalue_network(data).get(key)
             out = out.unsqueeze(data.dim()) if self.num_critics == 1 else out  # [*B, size]
         else:
-            out = self._each(data, params).get(key).movedim(0, data.dim())
+            each: Any = self._each
+            out = each(data, params).get(key).movedim(0, data.dim())
         out = out.unsqueeze(-1) if out.dim() == data.dim() + 1 else out.flatten(data.dim() + 1)
         return out if members is None else out[..., members, :]
 
@@ -209,9 +210,9 @@ class QLoss(Loss):
         if steps is not None:  # TorchRL's MultiStep drops the 1; a power of whole numbers would be float32 for any
             steps = steps.reshape(batch.batch_size).to(gamma.dtype)
         target: Any = bootstrap_target(reward, next_value, terminated, gamma, steps)
-        if not self.augmented:
-            return target
-        return target.mixed() if isinstance(target, Returns) else target.mean(0, keepdim=True).expand_as(target)
+        if self.augmented:
+            target = target.mixed() if isinstance(target, Returns) else target.mean(0, keepdim=True).expand_as(target)
+        return cast(Value, target)
 
     def regress(self, batch: TensorDictBase, outputs: Tensor, target: Returns) -> tuple[Tensor, Tensor]:
         """The loss of the critics' ``outputs [*B, critics, size]`` at the target, reduced, and their values.
@@ -252,7 +253,7 @@ class QLoss(Loss):
         return [keys.action, *networks, *[("next", *((key,) if isinstance(key, str) else key)) for key in after]]
 
 
-def _arranged(critics: Critics, number: int) -> tuple[list[TensorDictModule], int, bool]:
+def _arranged(critics: Critics, number: int) -> tuple[list[Any], int, bool]:
     """The critics' networks, how many critics these are, and whether one network is used as it is."""
     several = isinstance(critics, list | tuple)
     networks = list(critics) if several else [critics]

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, cast
 
 import gymnasium as gym
 import torch
@@ -137,7 +137,7 @@ def imported(name: str) -> Callable[[gym.Env], gym.Env]:
         raise UserError(f"--wrapper {name}: no module '{module}', neither here nor installed") from None
     if not callable(found):
         raise UserError(f"--wrapper {name}: {'it is no function' if found else 'the module has no ' + repr(function)}")
-    return found
+    return cast(Any, found)
 
 
 def made_here(env_id: str, wrapper: str | None, modules: list[str], here: Path, **kwargs: Any) -> gym.Env:

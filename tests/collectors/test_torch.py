@@ -163,7 +163,8 @@ def evaluation(num_envs: int, seed: int, workers: int = 1) -> envs.VectorEnv:
 class PendulumArgs(run.RunArgs):
     """Settings of a run on an environment that has no id."""
 
-    make_env = staticmethod(evaluation)
+    def make_env(self, num_envs: int, seed: int, workers: int = 1) -> envs.VectorEnv:
+        return evaluation(num_envs, seed)
 
 
 def pendulum_agent(args: PendulumArgs, env: envs.VectorEnv) -> run.Agent:

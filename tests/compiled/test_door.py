@@ -219,6 +219,7 @@ def test_choice():
 def step_of(mode):
     update = make_agent(compile=mode, epochs=1)
     metrics = update(make_rollout())
+    assert update._plan is not None
     return update._plan.native[0], metrics["loss_objective"]
 
 
@@ -254,6 +255,7 @@ def test_the_public_step_reads_what_its_data_holds_now():
     rollout, results = make_rollout().reshape(-1), []
     for mode in ("off", "record"):
         agent = make_agent()
+        assert agent.advantage is not None
         data, optimizer = agent.advantage(rollout.clone()), agent.optimizer
         params = optimizer.param_groups[0]["params"]
 

@@ -19,8 +19,8 @@ REFERENCE = ("next", "ref_log_probs", "full")
 class Table(TensorDictModuleBase):
     """Logits that are parameters, one a token of the batch."""
 
-    in_keys = [TOKENS, ATTENTION, COMPLETION]
-    out_keys = [LOG_PROBS]
+    in_keys = [TOKENS, ATTENTION, COMPLETION]  # pyright: ignore[reportAssignmentType]
+    out_keys = [LOG_PROBS]  # pyright: ignore[reportAssignmentType]
 
     def __init__(self, rows, length, vocab):
         super().__init__()

@@ -310,7 +310,7 @@ def test_augmented_copies_share_the_mean_of_their_targets_and_the_actor_takes_th
 def test_the_terms_of_a_composite_action_are_those_of_its_one_part():
     env = envs.make("Pendulum-v1")
     plain = losses.SACLoss(modules.tanh_normal_actor(env, (8,)), modules.q_value(env, 2, (8,)), target_entropy=-1.0)
-    net = plain.actor_network[0]
+    net = plain.actor_network[0]  # pyright: ignore[reportIndexIssue]
     keys = [("params", "torque", "loc"), ("params", "torque", "scale")]
     net = TensorDictModule(net.module, net.in_keys, keys)
     kwargs = {"distribution_map": {"torque": TanhNormal}, "extra_kwargs": {"torque": {"low": -2.0, "high": 2.0}}}

@@ -1,5 +1,7 @@
 """A sum of losses: entries, targets, keys and coefficients of each, and an update that trains both."""
 
+from typing import Any
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -124,7 +126,7 @@ def test_targets_of_every_part_move_also_where_two_have_one_name():
     average()
     for part in soft:
         for name in ("actor_network", "qvalue_network") if part.delay_actor else ("qvalue_network",):
-            pair = part._modules[f"target_{name}_params"], part._modules[f"{name}_params"]
+            pair: Any = part._modules[f"target_{name}_params"], part._modules[f"{name}_params"]
             for x, y in zip(*(net.values(True, True) for net in pair), strict=True):
                 torch.testing.assert_close(x, y.data)
     assert both.gamma_2 is soft[1].gamma and both.actor_network_2 is soft[1].actor_network

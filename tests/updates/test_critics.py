@@ -89,6 +89,7 @@ def test_the_compiled_step_draws_anew_each_time(block):
         update.buffer.extend(collector.rollout())
     index = update.buffer.sample_index(32)[0]
     update.train(1)
+    assert update._plan is not None
     values = {round(update._plan.every(update.buffer.data, index)[1].item(), 4) for _ in range(30)}
     # redq: 10 pairs of 5, whose minima differ; droq: masks of their own in each of 30 steps
     assert len(values) > (3 if block == "redq" else 25), values

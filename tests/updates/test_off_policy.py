@@ -66,6 +66,7 @@ def test_eager_equals_compiled(settings):
         metrics = train(update, collector)
         results.append((weights(update), metrics))
         assert (update.compile_seconds > 0) == (compile == "on")
+        assert update._plan is not None
         for step in (update._plan.every, update._plan.critics):
             assert step.native[0].rung == ("recorded and compiled" if compile == "on" else "eager")
     (a, eager), (b, compiled) = results
