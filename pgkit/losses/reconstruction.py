@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, dispatch
 from tensordict.utils import NestedKey
@@ -55,7 +56,7 @@ class ReconstructionLoss(Loss):
         self.key = key
         self.convert_to_functional(TensorDictModule(encoder, [key], ["features"]), "encoder_network")
         self.convert_to_functional(TensorDictModule(decoder, ["features"], ["decoded"]), "decoder_network")
-        self.register_coeff_buffer("latent_coeff", latent_coeff)
+        self.register_coeff_buffer("latent_coeff", latent_coeff, dtype=torch.float64)
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -53,7 +53,8 @@ class Policy:
     def action_key(self) -> Key:
         """The entry that the actor writes its action to; a group's lies under the group's name."""
         actor: Any = self.actor
-        return next((key for key in actor.out_keys if key == "action" or key[-1] == "action"), "action")
+        written: Any = getattr(actor, "out_keys", ())  # a plain module may write its action as it likes
+        return next((key for key in written if key == "action" or key[-1] == "action"), "action")
 
     @property
     def memory(self) -> Memory | None:

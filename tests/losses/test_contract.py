@@ -11,8 +11,8 @@ from pgkit import envs, heads, losses, modules
 from pgkit.errors import UserError
 
 BASES = {"Loss", "PolicyLoss", "QLoss", "ActorCriticLoss", "SoftQLoss", "Sum"}
-OF_TOKENS = {"GRPOLoss", "SFTLoss"}  # no environment to build networks from: tests/losses/test_grpo.py
-ALGORITHMS = sorted(set(losses.__all__) - BASES - OF_TOKENS)
+ELSEWHERE = {"GRPOLoss", "SFTLoss", "ReconstructionLoss"}  # no actor of an environment: tests of their own
+ALGORITHMS = sorted(set(losses.__all__) - BASES - ELSEWHERE)
 CRITICS = 4
 
 
