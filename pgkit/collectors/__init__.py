@@ -1,8 +1,9 @@
 """Collectors: iterables of rollouts."""
 
 from pgkit.collectors.asynchronous import AsyncCollector
+from pgkit.collectors.ray import RayCollector
 from pgkit.collectors.tokens import TokenCollector
 from pgkit.collectors.torchrl import TorchRLCollector
 from pgkit.collectors.vector import VectorCollector
 
-__all__ = ["AsyncCollector", "TokenCollector", "TorchRLCollector", "VectorCollector"]
+__all__ = ["AsyncCollector", "RayCollector", "TokenCollector", "TorchRLCollector", "VectorCollector"]
