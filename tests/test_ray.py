@@ -8,13 +8,13 @@ import ray
 import torch
 
 from pgkit import collectors, envs, modules
+from pgkit.collectors.cluster import connect
 
 
 @pytest.fixture(scope="module", autouse=True)
 def cluster():
     """One small cluster for all tests; its processes and its shared memory are gone after them."""
-    os.environ["RAY_worker_niceness"] = "0"
-    ray.init(address="local", num_cpus=8, include_dashboard=False, log_to_driver=False, logging_level="ERROR")
+    connect(cpus=8)
     yield
     ray.shutdown()
 

@@ -187,7 +187,7 @@ class RayWorkers:
             raise WorkerEnded(f"collecting process {i} ended {_MOST_DEATHS} times at the same request: {reason}")
         getLogger("pgkit").warning(
             "collecting process %d ended (killed, out of memory, or its node is gone): it is made again, %s",
-            i, f"and {lost} episodes begin anew" if lost else "and collects the same rollout",
+            i, f"and {lost} episodes begin anew" if lost else f"and collects the same rollout [{reason}]",
         )  # fmt: skip
         self._make(i)
 
