@@ -15,7 +15,7 @@ from pgkit import advantages, collectors, controllers, losses, modules, run, upd
 
 
 @dataclass
-class Args(run.RunArgs):
+class Args(run.RayArgs):
     """Settings of PPO."""
 
     env_id: str = "HalfCheetah-v5"
@@ -134,7 +134,7 @@ def agent(args: Args, env: EnvBase) -> run.Agent:
 def main(args: Args) -> None:
     """Trains, logs, evaluates, saves."""
     with run.Run(args, recipe="ppo") as log:
-        env = args.make_env(args.num_envs, args.seed, args.workers)
+        env = args.make_env(args.num_envs, args.seed, args.processes())
         with run.placed(args):
             built = agent(args, env)
         update = updates.OnPolicyUpdate(
@@ -151,11 +151,16 @@ def main(args: Args) -> None:
             total_frames=args.total_frames,
             compile=args.compile,
         )
-        sizes = {"frames_per_batch": args.num_envs * args.steps, "total_frames": args.total_frames}
+        if args.learners > 1:
+            collectors.connect(args.ray_address, args.processes() + args.learners)
+            update = updates.RayLearners(update, args.learners)
+        frames = args.num_envs * args.steps
         if args.collector == "pgkit":
-            collector = collectors.VectorCollector(env, built.actor, **sizes, compile=args.compile)
+            collector = run.collector(args, env, built.actor, frames_per_batch=frames)
         else:
-            collector = collectors.TorchRLCollector(env, built.actor, **sizes)
+            collector = collectors.TorchRLCollector(
+                env, built.actor, frames_per_batch=frames, total_frames=args.total_frames
+            )
 
         log.track(agent=built, eval_env=args.make_env, update=update, collector=collector)
         for rollout in collector:

@@ -1,8 +1,9 @@
-"""Ray actors that each hold some environments and the policy: the workers of a collector, on any machine of a cluster."""
+"""Ray actors that each hold some environments and the policy: a collector's workers, on any machine of a cluster."""
 
 from __future__ import annotations
 
 import copy
+import os
 import sys
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
@@ -78,8 +79,17 @@ class RayWorkers:
         self.deaths = self.lost = 0
         for i in range(self._count):
             self._make(i)
-            self._ask(i, "there")
+            self._ask(i, "place")
         self._all()
+
+    def places(self) -> list[tuple[str, int]]:
+        """Where each actor is: a machine's address, and the number of a process there."""
+        return self._ray.get(self._there)
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the actors are there: any failure but a death ends them all."""
+        return bool(self._actors)
 
     def begin(self, weights: Iterable[Tensor], step: int, random: bool = False) -> None:
         """Starts a rollout with these weights, the values of the actor's ``state_dict()``; as :meth:`Share.collect`."""
@@ -134,7 +144,7 @@ class RayWorkers:
     def _make(self, i: int) -> None:
         """Makes an actor, where the one before was, and gives it that one's request again."""
         actor = self._actors[i] = self._remote.remote()
-        self._there[i] = actor.there.remote()
+        self._there[i] = actor.place.remote()
         self._built[i] = actor.build.remote(sys.path, self._orders[i], self._known[i].past)
         if self._asked[i] is not None:
             self._ask(i, *self._asked[i])
@@ -187,7 +197,7 @@ class RayWorkers:
             raise WorkerEnded(f"collecting process {i} ended {_MOST_DEATHS} times at the same request: {reason}")
         getLogger("pgkit").warning(
             "collecting process %d ended (killed, out of memory, or its node is gone): it is made again, %s",
-            i, f"and {lost} episodes begin anew" if lost else f"and collects the same rollout [{reason}]",
+            i, f"and {lost} episodes begin anew" if lost else "and collects the same rollout",
         )  # fmt: skip
         self._make(i)
 
@@ -215,8 +225,9 @@ class _Order(NamedTuple):
 class RemoteShare:
     """A share of the environments in an actor; the first argument of each request is a step that must have worked."""
 
-    def there(self, _: None = None) -> None:
-        """Says that the actor has found a place."""
+    def place(self, _: None = None) -> tuple[str, int]:
+        """Where the actor has found a place: a machine's address, and the number of a process there."""
+        return ray_module().util.get_node_ip_address(), os.getpid()
 
     def build(self, path: Sequence[str], order: bytes, past: Past) -> None:
         """Makes the environments and records the policy; brings them to where another share was."""

@@ -34,11 +34,6 @@ class Pool(Protocol):
 
     def wait_any(self, pools: Sequence[Any], /) -> None: ...
 
-    @staticmethod
-    def wait_any(pools: Sequence[Workers]) -> None:
-        """Waits until one of these has something to say."""
-        wait([pipe for workers in pools for pipe in workers.pipes])
-
     def finish(self) -> Entries: ...
 
     def state_dict(self) -> list[dict[str, Any]]: ...
