@@ -26,8 +26,8 @@ class TorchRLCollector:
     ``("next", "episode_reward")`` and ``("next", "step_count")`` that finished episodes are read from; for a recurrent
     actor of pgkit's, also ``InitTracker`` and a primer of its ``recurrent_state``.
 
-    With ``backend="ray"`` each function in ``env`` makes the environment of one Ray actor. The present weights go to the
-    actors before every rollout, which has the environments of all, ``[actors * N, T]``; an actor takes one CPU and no GPU.
+    With ``backend="ray"`` each function in ``env`` makes the environment of one Ray actor, which takes one CPU and no
+    GPU. The present weights go to the actors before every rollout; that has the environments of all.
 
     Args:
         env: any TorchRL environment, pgkit's included; for a recurrent actor, a batch of environments. Or a list of
