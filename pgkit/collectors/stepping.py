@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
 from typing import Any
@@ -131,7 +132,7 @@ class Share:
     def rebuild(self, past: Past) -> None:
         """Goes on where another share was: from a state that it told, through the actions that it took since."""
         if past.state is not None:
-            self.load_state_dict(past.state)
+            self.load_state_dict(pickle.loads(past.state))
         elif self._fresh is None:
             self._fresh = self.simulator.reset()
         for actions in past.actions:

@@ -49,32 +49,36 @@ class TorchRLCollector:
     ) -> None:
         from torchrl.collectors import Collector  # slow to import, and rarely needed
 
-        one = env if isinstance(env, EnvBase) else env[0]()
+        makers = [] if isinstance(env, EnvBase) else list(env)
+        one = env if isinstance(env, EnvBase) else makers[0]()
         check_types(actor, one.fake_tensordict())
         state = memory(actor, one.batch_size.numel())
         if state and not one.batch_size:
             raise UserError("a recurrent actor reads a batch of environments, this is one: SerialEnv(1, make_env)")
         primers = {key: Unbounded(x.shape[1:]) for key, x in state.items() if key != "is_init"}
-        made: Any = one if one is env else [partial(_transformed, make, primers) for make in env]
+        made: Any = [partial(_transformed, make, primers) for make in makers]
         self.frames, self.total_frames, self.compile_seconds = 0, total_frames, 0.0
         kwargs = {"trust_policy": True} | kwargs
         self._on_ray = kwargs.get("backend") == "ray"
         if self._on_ray:
+            if not makers:
+                raise UserError('backend="ray" takes a list of functions, one for each actor: [make_env, make_env]')
             one.close()
             connect(cpus=len(made))
             given = kwargs.get("backend_options", {})
             kwargs |= {"sync": kwargs.get("sync", True), "num_collectors": len(made)}
             kwargs["backend_options"] = {"remote_configs": {"num_cpus": 1, "num_gpus": 0}, **_PUSHES, **given}
             total_frames = sys.maxsize if total_frames < 0 else total_frames  # TorchRL would collect none
-        elif one is env:
-            made = _transformed(env, primers)
+        elif not makers:
+            made = _transformed(one, primers)
             kwargs = {"auto_register_policy_transforms": True} | kwargs
         self.collector = Collector(made, actor, frames_per_batch=frames_per_batch, total_frames=total_frames, **kwargs)
 
     def __iter__(self) -> Iterator[TensorDictBase]:
         if self._on_ray:
             self.collector.update_policy_weights_()
-        for rollout in self.collector:  # which counts from 0 again after a resume
+        rollouts: Any = self.collector
+        for rollout in rollouts:  # which counts from 0 again after a resume
             if self._on_ray and rollout.dim() > 2:  # one more dimension, of the actors
                 rollout = rollout.flatten(0, -2)
             self.frames += rollout.numel()
