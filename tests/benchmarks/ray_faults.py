@@ -65,6 +65,7 @@ def actors(kills: int) -> None:
 
     with_kills(spread, kills, kill)
     spread.shutdown()
+    ray.shutdown()
 
 
 def nodes(kills: int) -> None:
@@ -127,4 +128,6 @@ if __name__ == "__main__":
     given = parser.parse_args()
     function, kills = parts[given.part]
     random.seed(0)
+    shared = set(os.listdir("/dev/shm"))
     function(given.kills or kills)
+    print("left in shared memory:", sorted(set(os.listdir("/dev/shm")) - shared) or "nothing")
