@@ -110,7 +110,7 @@ class Recorded:
             raise RuntimeError(wrong[0])
         for call, arguments in zip(calls, others, strict=True):
             self._check(call, pure, arguments)
-        door = compiled(every_branch(pure, *others[0]), {}, lambda *_: others[1:], mode, name, most=_MOST)
+        door = compiled(every_branch(pure, *others[0]), {}, lambda *_: others[1:], mode, name, most=_MOST, fixed=True)
         self._run = door.bind(*others[0])
         self.rung, self.seconds = door.rung, door.seconds
 

@@ -79,6 +79,17 @@ def test_a_resumed_run_equals_the_straight_one(flags: Any, tmp_path: Path):
     assert rows(tmp_path / "straight") == rows(tmp_path / "resumed")
 
 
+def test_an_evaluation_in_between_changes_nothing(tmp_path: Path):
+    given = ("--env-id", "vmas/balance", "--env.max_episode_steps", 30, *PLAIN, "--steps", 25, "--epochs", 1)
+    pgkit("run", "mappo", *given, "--run-dir", tmp_path / "often")
+    pgkit("run", "mappo", *given, "--eval-every", 0, "--run-dir", tmp_path / "once")
+    trained = [
+        [{k: x for k, x in row.items() if not k.startswith("eval/")} for row in rows(tmp_path / name)]
+        for name in ("often", "once")
+    ]
+    assert trained[0][-1] == trained[1][-1] and len(trained[0]) >= len(trained[1])
+
+
 @pytest.mark.parametrize(
     "flags",
     [
@@ -151,10 +162,11 @@ def test_two_groups_are_trained_as_two_agents_would_be():
     assert all(torch.equal(a, b) for a, b in zip(both["grads"], grads, strict=True))
 
 
-def test_a_compiled_update_equals_the_eager_one():
+@pytest.mark.parametrize("make", [Fading, Unlike])
+def test_a_compiled_update_equals_the_eager_one(make: Any):
     results = []
     for compile in ("off", "on"):
-        _, agent, rollout = built(Fading)
+        _, agent, rollout = built(make)
         results.append(trained(agent, rollout, compile, epochs=1))
     (eager, weights), (native, theirs) = results
     for a, b in zip(weights, theirs, strict=True):
