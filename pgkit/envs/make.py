@@ -181,7 +181,7 @@ def _share(function: Callable[..., Any], settings: Settings, first: int, count: 
     """The environments ``first`` to ``first + count``: what the function makes decides how."""
     own_seed = seed if first == 0 else episode_seed(seed, first, 0)
     given = {"num_envs": count, "seed": own_seed, "device": settings.device, "groups": settings.groups}
-    given |= {"compile": settings.compile}
+    given |= {"compile": None if settings.compile == "off" else settings.compile}
     names = _named(function) - {name for name, value in given.items() if value is None}
     made = function(**{name: given[name] for name in names & given.keys()})
     if isinstance(made, EnvBase | GymVectorEnv):

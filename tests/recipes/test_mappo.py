@@ -5,6 +5,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import imageio.v2 as imageio
+import numpy as np
 import pytest
 import torch
 
@@ -104,6 +106,19 @@ def test_runs_for_a_few_hundred_frames(tmp_path: Path, flags: Any):
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary["frames"] == 400 and summary["eval/mean_reward"] < 100
     assert "mean_reward" in pgkit("eval", tmp_path / "run", "--episodes", 2).stdout
+
+
+def test_a_run_of_groups_is_drawn_plotted_and_loaded(tmp_path: Path):
+    small = ("--num-envs", 4, "--total-frames", 200, "--steps", 25, "--eval-episodes", 2, "--compile", "off")
+    pgkit("run", "mappo", "--env-id", "mpe2/simple_adversary_v3", *small, "--run-dir", tmp_path / "run")
+    said = pgkit("eval", tmp_path / "run", "--episodes", 1, "--video", tmp_path / "out.gif").stdout
+    frames = imageio.mimread(tmp_path / "out.gif")
+    assert "out.gif" in said and len(frames) >= 25 and (frames[0] != frames[10]).any()
+    pgkit("plot", tmp_path / "run", "--out", tmp_path / "curve.png")
+    assert (tmp_path / "curve.png").stat().st_size > 1_000
+    policy = run.load_policy(tmp_path / "run")
+    made = policy.predict({key[0]: np.zeros(shape, np.float32) for key, shape in policy.shapes.items()})
+    assert {name: x.shape for name, x in made.items()} == {"adversary": (1,), "agent": (2,)}
 
 
 def built(make: Any, frames: int = 64, **settings: Any) -> Any:

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 import torch
 from tensordict.nn import TensorDictSequential
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
-from pgkit import advantages, collectors, data, envs, losses, modules, run, updates
+from pgkit import advantages, collectors, envs, losses, modules, run, updates
 from pgkit.errors import UserError
+from pgkit.run.policy import Policy
 from tests.envs.test_agents import Fading, Unlike
 
 
@@ -86,7 +88,7 @@ def off_policy(kind: str, env: Any) -> tuple[Any, Any]:
         actor = modules.deterministic_actor(env, (32,))
         explored = modules.GaussianExploration(actor, env, sigma=0.3)
         loss = losses.TD3Loss(actor, critic, bounds=(-1.0, 1.0), gamma=0.5)
-    buffer = data.ReplayBuffer(env, capacity=4_000, seed=0)
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(4_000), batch_size=64)  # pgkit's own has no groups
     update = updates.OffPolicyUpdate(
         loss, buffer, torch.optim.Adam([p for p in loss.parameters() if p.requires_grad], lr=3e-3), batch_size=64,
         updates_per_step=0.5, compile="off",
@@ -133,3 +135,27 @@ def test_two_groups_in_one_loop_are_trained_by_an_update_each():
     assert moved == {"speaker": False, "listener": True}
     learners["speaker"](rollout)
     assert rollout["speaker", "advantage"].shape == rollout["listener", "advantage"].shape == (4, 16, 1, 1)
+
+
+def test_a_policy_of_groups_predicts_on_plain_arrays():
+    torch.manual_seed(0)
+    env = envs.make(Fading, num_envs=2, seed=1)
+    team = Policy.of(modules.gaussian_actor(env, (8,), log_std=-9.0), env)
+    one, many = np.array([[0.5, 0.0], [0.5, 1.0]], np.float32), np.zeros((3, 2, 2), np.float32)
+    assert team.predict(one).shape == (2, 1) and team.predict(many).shape == (3, 2, 1)
+    np.testing.assert_array_equal(team.predict({"agents": one}), team.predict(one))
+    np.testing.assert_array_equal(team.predict({("agents", "observation"): one}), team.predict(one))
+    assert np.abs(team.predict(1e6 * many + 1e6)).max() <= 1
+
+    env = envs.make(Unlike, num_envs=2, seed=1)
+    actors = modules.categorical_actor(env, (8,), group="speaker"), modules.gaussian_actor(env, (8,), group="listener")
+    with torch.no_grad():
+        actors[1].get_submodule("module.0.module.head").weight.mul_(1e4)
+    both = Policy.of(TensorDictSequential(*actors), env)
+    given: Any = {"speaker": {"observation": one[:1], "action_mask": [[False, False, True]]}, "listener": one[1:]}
+    made = both.predict(given)
+    assert made["speaker"].tolist() == [2] and made["listener"].shape == (1, 1) and np.abs(made["listener"]).max() == 1
+    with pytest.raises(UserError, match=r"predict got speaker.observation; the policy takes the entries"):
+        both.predict({"speaker": one[:1]})
+    with pytest.raises(UserError, match=r"shape \[4, 2\]; the policy takes \[2, 2\] or a batch"):
+        team.predict(np.zeros((4, 2)))
