@@ -15,7 +15,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from pgkit.compiled.constants import Constants, tensors_of
-from pgkit.compiled.native import compile_record, torch_compiled
+from pgkit.compiled.native import check_shapes, compile_record, torch_compiled
 from pgkit.compiled.recorded import Bind, Function, Recorder, recorded
 from pgkit.compiled.trial import check_repeats
 from pgkit.errors import UserError
@@ -72,6 +72,7 @@ class Compiled:
         name: what the log calls it: ``the update``.
         holds: further tensors that it changes or that change in place: optimizer state, priorities, a cache.
         most: operations that are worth compiling, of a function that may be a long loop; it skips ``torch.compile``.
+        fixed: refuses a record in which values decide how many elements something has.
 
     Attributes:
         seconds: spent recording and compiling so far.
@@ -85,6 +86,7 @@ class Compiled:
     name: str
     holds: Sequence[Tensor] = ()
     most: int | None = None
+    fixed: bool = False
     seconds: float = field(default=0.0, init=False)
     rung: str = field(default=EAGER, init=False)
     _built: dict[Any, Bind] = field(default_factory=dict, init=False)
@@ -165,6 +167,8 @@ class Compiled:
         return bind
 
     def _compile(self, graph: Any, inputs: Sequence[Tensor]) -> Callable[..., Any]:
+        if self.fixed:
+            check_shapes(graph)
         if self.rung == REPLAYED:
             return graph.forward
         if self.most is not None and len(graph.graph.nodes) > self.most:
