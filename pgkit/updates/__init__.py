@@ -1,6 +1,7 @@
 """Updates: one call trains on one rollout or on replayed batches, as one compiled graph a step."""
 
 from pgkit.optim import Together
+from pgkit.updates.data_parallel import data_parallel
 from pgkit.updates.off_policy import OffPolicyUpdate
 from pgkit.updates.on_policy import OnPolicyUpdate
 from pgkit.updates.step import GradientStep
@@ -12,4 +13,5 @@ __all__ = [
     "OnPolicyUpdate",
     "Together",
     "TrustRegionUpdate",
+    "data_parallel",
 ]
