@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Iterator
-from multiprocessing.connection import wait
 from typing import Any
 
 from tensordict import TensorDictBase
@@ -16,7 +15,7 @@ from torchrl.envs import EnvBase
 from pgkit.collectors.actor import Beside, example
 from pgkit.collectors.stepping import as_rollout
 from pgkit.collectors.vector import count, say_resume
-from pgkit.collectors.workers import Workers, check_splits, shares
+from pgkit.collectors.workers import MakePool, Pool, Workers, check_splits, shares
 from pgkit.compiled import choose
 from pgkit.envs import vector_of
 from pgkit.errors import UserError
@@ -45,6 +44,7 @@ class AsyncCollector:
             workers, they take turns and runs repeat themselves.
         delay: order with the weights of so many updates ago: forced lag, to study it.
         compile: ``on``, ``off`` or ``auto``, for the policy.
+        pool: makes the processes that collect.
 
     Raises:
         UserError: sizes that do not fit, environments that this process holds, or an actor that was built for another
@@ -63,6 +63,7 @@ class AsyncCollector:
         max_lag: int | None = None,
         delay: int = 0,
         compile: str = "auto",
+        pool: MakePool = Workers,
     ) -> None:
         env = vector_of(env)
         check_splits(env)
@@ -86,7 +87,7 @@ class AsyncCollector:
         calls = None if total_frames < 0 else total_frames / env.num_envs
         self._compile = choose(compile, calls, least_calls=50_000)
         self._outputs, self._beside = example(env, actor), Beside(actor, env)
-        self._groups: list[Workers] = []
+        self._make_pool, self._groups = pool, list[Pool]()
         self._updates = 0  # rollouts handed out: the caller makes one update with each
         self._orders = [0] * len(self._bounds)  # rollouts ordered, by group
         self._versions = [0] * len(self._bounds)  # the update whose weights a group collects with
@@ -155,7 +156,7 @@ class AsyncCollector:
     def _start(self) -> None:
         start = time.perf_counter()
         settings = self.env, self._beside.actor, self._steps, self._outputs, self._compile
-        self._groups = [Workers(*settings, bounds) for bounds in self._bounds]
+        self._groups = [self._make_pool(*settings, bounds) for bounds in self._bounds]
         self.compile_seconds += time.perf_counter() - start
 
     def _order(self, group: int) -> None:
@@ -182,4 +183,4 @@ class AsyncCollector:
             for group in by_age:
                 if self._done[group] or self._groups[group].ready():
                     return group
-            wait([pipe for workers in self._groups for pipe in workers.pipes])
+            self._groups[0].wait_any(self._groups)

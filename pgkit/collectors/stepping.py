@@ -13,6 +13,7 @@ from torch import Tensor
 
 from pgkit.collectors.actor import is_state, memory, path_of
 from pgkit.collectors.policy import RowPolicy, choices, function_of, padded_rows, random_actions
+from pgkit.collectors.rebuild import Past
 from pgkit.compiled import Mode
 from pgkit.envs import VectorEnv
 from pgkit.errors import UserError
@@ -125,6 +126,21 @@ class Share:
                 if self._mask is not None and made.mask is not None:
                     self._mask[t].copy_(made.mask)
         self._fresh, self._memory = fresh, remembered
+
+    @torch.inference_mode()
+    def rebuild(self, past: Past) -> None:
+        """Goes on where another share was: from a state that it told, through the actions that it took since."""
+        if past.state is not None:
+            self.load_state_dict(past.state)
+        elif self._fresh is None:
+            self._fresh = self.simulator.reset()
+        for actions in past.actions:
+            for now in zip(*(x.unbind(0) for x in actions.values()), strict=True):
+                made = self.simulator.step(dict(zip(actions, now, strict=True)))
+                self._fresh, begun = made.fresh, made.begun()
+        if past.actions and self._memory:
+            names = [key for key in self._memory if key != "is_init"]
+            self._memory = {"is_init": begun.unsqueeze(-1), **dict(zip(names, past.memory.values(), strict=True))}
 
     def state_dict(self) -> dict[str, Any]:
         """The simulator's state, and the policy's memory."""

@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase
 
 from pgkit.collectors.actor import Beside, example
 from pgkit.collectors.stepping import MASK, Share, allocate, as_rollout, regroup
-from pgkit.collectors.workers import Workers, check_splits
+from pgkit.collectors.workers import MakePool, Pool, Workers, check_splits
 from pgkit.compiled import Constants, choose
 from pgkit.envs import VectorEnv, vector_of
 from pgkit.errors import UserError, check_whole_number
@@ -41,6 +41,8 @@ class VectorCollector:
         init_random_frames: the rollouts that begin before so many frames draw actions uniformly from the action spec;
             their log-probability is NaN.
         compile: ``on``, ``off``, or ``auto``: where a C++ compiler is there and ``total_frames`` is large enough.
+        pool: makes the processes that collect; None: :class:`~pgkit.collectors.workers.Workers`, for ``env.workers``
+            above 1.
 
     Raises:
         UserError: sizes that do not fit, an actor that was built for another environment; while collecting,
@@ -56,9 +58,11 @@ class VectorCollector:
         total_frames: int = -1,
         init_random_frames: int = 0,
         compile: str = "auto",
+        pool: MakePool | None = None,
     ) -> None:
         env = vector_of(env)
-        if env.workers > 1:
+        self._pooled = env.workers > 1 or pool is not None
+        if self._pooled:
             check_splits(env)
         check_whole_number(1, frames_per_batch=frames_per_batch)
         if frames_per_batch % env.num_envs:
@@ -80,7 +84,8 @@ class VectorCollector:
         steps = None if total_frames < 0 else total_frames / env.num_envs
         self._compile = choose(compile, steps, least_calls=50_000)
         self._outputs, self._beside = example(env, actor), Beside(actor, env)
-        self._workers: Workers | None = None
+        self._make_pool: MakePool = pool or Workers
+        self._workers: Pool | None = None
         self._share: Share | None = None
         self._constants: Constants | None = None
 
@@ -91,7 +96,7 @@ class VectorCollector:
     def rollout(self) -> TensorDictBase:
         """Collects one rollout with the actor's present weights."""
         step, random = self._rollouts * self._steps, self.frames < self.init_random_frames
-        if self.env.workers > 1:
+        if self._pooled:
             self._pool().begin(self.actor.state_dict().values(), step, random)
             buffers = self._pool().finish()
         else:
@@ -105,14 +110,14 @@ class VectorCollector:
 
     def state_dict(self) -> dict[str, Any]:
         """Counters, and the state of every environment and of the policy's memory."""
-        shares = self._pool().state_dict() if self.env.workers > 1 else [self._alone().state_dict()]
+        shares = self._pool().state_dict() if self._pooled else [self._alone().state_dict()]
         return {"frames": self.frames, "rollouts": self._rollouts, "shares": shares}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restores :meth:`state_dict`, also one taken with another number of workers."""
         self.frames, self._rollouts = state["frames"], state["rollouts"]
         say_resume(self.env)
-        if self.env.workers > 1:
+        if self._pooled:
             self._pool().load_state_dict(state["shares"])
         else:
             self._alone().load_state_dict(regroup(state["shares"], [0, self.env.num_envs])[0])
@@ -125,7 +130,7 @@ class VectorCollector:
         self.env.close_simulator()
         self._share = None
 
-    def _pool(self) -> Workers:
+    def _pool(self) -> Pool:
         """The workers; they get new weights only, and start again where something else in the actor was replaced."""
         changed = self._constants.changed(memory=False) if self._workers and self._constants else None
         state = None
@@ -140,7 +145,7 @@ class VectorCollector:
         if self._workers is None:
             start = time.perf_counter()
             self._constants, self._beside = Constants({"the actor": self.actor}), Beside(self.actor, self.env)
-            self._workers = Workers(self.env, self._beside.actor, self._steps, self._outputs, self._compile)
+            self._workers = self._make_pool(self.env, self._beside.actor, self._steps, self._outputs, self._compile)
             self.compile_seconds += time.perf_counter() - start
             if state is not None:
                 self._workers.load_state_dict(state)

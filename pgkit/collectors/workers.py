@@ -7,10 +7,10 @@ import signal
 import sys
 import traceback
 import weakref
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from itertools import pairwise
-from multiprocessing.connection import Connection
-from typing import Any, NamedTuple
+from multiprocessing.connection import Connection, wait
+from typing import Any, NamedTuple, Protocol
 
 import cloudpickle
 import torch
@@ -23,6 +23,32 @@ from pgkit.compiled import Mode, load_matmul_state, matmul_state
 from pgkit.envs import VectorEnv
 from pgkit.errors import UserError
 from pgkit.seams import Entries
+
+
+class Pool(Protocol):
+    """Processes that share environments, wherever they are: :meth:`begin`, then :meth:`finish`."""
+
+    def begin(self, weights: Iterable[Tensor], step: int, random: bool = False) -> None: ...
+
+    def ready(self) -> bool: ...
+
+    def wait_any(self, pools: Sequence[Any], /) -> None: ...
+
+    @staticmethod
+    def wait_any(pools: Sequence[Workers]) -> None:
+        """Waits until one of these has something to say."""
+        wait([pipe for workers in pools for pipe in workers.pipes])
+
+    def finish(self) -> Entries: ...
+
+    def state_dict(self) -> list[dict[str, Any]]: ...
+
+    def load_state_dict(self, states: list[dict[str, Any]], /) -> None: ...
+
+    def close(self) -> Any: ...
+
+
+MakePool = Callable[..., Pool]
 
 
 class WorkerEnded(RuntimeError):
@@ -92,6 +118,11 @@ class Workers:
     def ready(self) -> bool:
         """Whether :meth:`finish` would not wait."""
         return all(pipe.poll() for pipe in self.pipes)
+
+    @staticmethod
+    def wait_any(pools: Sequence[Workers]) -> None:
+        """Waits until one of these has something to say."""
+        wait([pipe for workers in pools for pipe in workers.pipes])
 
     def finish(self) -> Entries:
         """The rollout's buffers ``[T, N, ...]`` of this object's environments, the caller's to keep."""
