@@ -98,7 +98,7 @@ def test_a_shard_gives_batches_and_takes_late_errors_of_frames_that_it_still_has
     assert (seen == frames).all() and (reply["entries"]["priority_weight"] == 1).all()
     made.extend(packed(hand_made([4, 5, 6, 7, 8, 9, 10], [1] * 6), 1.0), updates=5)  # 0 and 1 leave
     made.write_back(torch.tensor([1, 2, 9]).numpy(), torch.tensor([100.0, 7.0, 0.5]).numpy(), updates=9)
-    by_frame = [float(made.buffer.sampler.tree.values[frame % made.buffer.rows]) for frame in range(2, 10)]
+    by_frame = [float(made.sampler.tree.values[frame % made.buffer.rows]) for frame in range(2, 10)]
     assert by_frame == [7, 2, 1, 1, 1, 1, 1, 0.5]
     ages = [float(made.made_at[frame % made.buffer.rows]) for frame in range(2, 10)]
     assert ages == [9, 3, 5, 5, 5, 5, 5, 9]
@@ -125,6 +125,7 @@ def test_the_learner_reads_writes_back_and_goes_on_without_a_shard(cluster, capl
     )
     metrics = update.train(3)
     assert metrics["loss_qvalue"] > 0 and update.updates == replay.updates == 3
+    assert replay.data is not None
     assert ((replay.data["observation"][:, 0] >= 100) == (replay.data["next", "reward"][:, 0] == 100)).all()
     shard_of = replay._current.shard
     errors = dict(zip(replay._frames.tolist(), replay.data["td_error"].tolist(), strict=True))  # the last of each wins

@@ -18,7 +18,7 @@ from pgkit.updates import on_policy
 ENVS, STEPS, ROUNDS = 4, 26, 2
 CASES = {  # of an update over 52 rows a learner: minibatches of 20, 20 and 12
     "minibatch": dict(recompute_advantage=True, epochs=2),
-    "rollout": dict(gae=dict(standardize=True), normalize=False, masked=True, epochs=2),
+    "rollout": dict(gae=dict(average_gae=True), normalize=False, masked=True, epochs=2),
     "accumulated": dict(accumulate=2, normalize=False),
     "masked minibatch": dict(masked=True),
     "own": dict(normalize=False, normalize_advantage=True, minibatch_size=None),
@@ -73,6 +73,7 @@ def learner(rank, port, folder):
             share = make_rollout(i, case.get("masked", False)).chunk(2)[rank].clone()
             metrics = update(share)
             normalizer.update(update.learners.gather(share["observation"]))
+        assert update._plan is not None
         results[name] = outcome(update, normalizer, metrics)
         results[name]["rungs"] = [native.rung for native in update._plan.native]
     results["errors"] = mistakes(rank)

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from logging import getLogger
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 
+from pgkit.data.prioritized import Prioritized
 from pgkit.data.replay import ReplayBuffer
 from pgkit.errors import UserError, check_whole_number
 from pgkit.files import shipped
@@ -148,14 +149,15 @@ class RayReplay:
         self.told(self._current.number, self._current.shard, 0, reply["stored"])
         if self.data is None:
             self._here = {key: torch.tensor(x) for key, x in reply["entries"].items()}
-            self.data = TensorDict({"td_error": torch.zeros(len(self._frames))}, batch_size=[len(self._frames)])
+            self.data = data = TensorDict({"td_error": torch.zeros(len(self._frames), device=self.device)})
             for key, x in self._here.items():
-                self.data.set(key, x)
-            self.data = self.data.to(self.device)
+                data.set(key, x.to(self.device))
+            data.batch_size = [len(self._frames)]
+            self._place = {key: data[key] for key in self._here}
         for key, x in reply["entries"].items():
             np.copyto(self._here[key].numpy(), x)
             if self.device.type != "cpu":
-                self.data[key].copy_(self._here[key])
+                self._place[key].copy_(self._here[key])
 
     def write_back(self) -> None:
         """Sends the ``td_error`` of the request in use to its shard."""
@@ -184,6 +186,7 @@ class _Shard:
 
         torch.set_num_threads(1)
         self.buffer: ReplayBuffer = cloudpickle.loads(make)(number)
+        self.sampler: Prioritized = cast(Prioritized, self.buffer.sampler)
         self.made_at = torch.zeros(self.buffer.rows, dtype=torch.float64)
         self.gather = self.buffer.gather(gamma)
 
@@ -201,7 +204,7 @@ class _Shard:
 
     def stored(self) -> tuple[int, float]:
         """Frames that can be drawn, and the sum of their priorities."""
-        return len(self.buffer), float(self.buffer.sampler.tree.sums.sum())
+        return len(self.buffer), float(self.sampler.tree.sums.sum())
 
     def sample(self, batch_size: int, batches: int) -> dict[str, Any]:
         index = self.buffer.sample_index(batch_size, batches)
@@ -218,9 +221,9 @@ class _Shard:
         number, error = torch.tensor(frames), torch.tensor(errors)
         kept = number >= self.buffer.start
         rows = number[kept] % self.buffer.rows
-        self.buffer.sampler.write_back(rows, error[kept])
+        self.sampler.write_back(rows, error[kept])
         self.made_at[rows] = updates
 
     def priorities(self, frames: Sequence[int]) -> list[float]:
         """Those of frames that are kept."""
-        return self.buffer.sampler.tree.values[torch.tensor(frames) % self.buffer.rows].tolist()
+        return self.sampler.tree.values[torch.tensor(frames) % self.buffer.rows].tolist()

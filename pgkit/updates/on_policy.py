@@ -225,7 +225,8 @@ class OnPolicyUpdate:
             return None
         rollouts = None if self.total_frames is None else self.total_frames / rollout.numel()
         mode = choose(self.compile, rollouts, least_calls=5_000)
-        return None if mode == "off" else CompiledAdvantage(cast(TensorDictModuleBase, self.advantage), mode)
+        block = cast(TensorDictModuleBase, self.advantage)
+        return None if mode == "off" else CompiledAdvantage(block, mode, self.learners.agree)
 
     def _follow_schedules(self) -> None:
         for name, schedule in self.schedules.items():
@@ -246,7 +247,7 @@ class OnPolicyUpdate:
 class CompiledAdvantage:
     """An advantage block in native code."""
 
-    def __init__(self, block: TensorDictModuleBase, mode: Mode) -> None:
+    def __init__(self, block: TensorDictModuleBase, mode: Mode, agree: Callable[[bool], bool] = bool) -> None:
         def entries(data: TensorDictBase) -> list[Tensor]:
             out = block(data.copy())
             return [out[key] for key in block.out_keys]
@@ -258,7 +259,13 @@ class CompiledAdvantage:
 
         self.block = block
         self.native = compiled(
-            entries, {"the advantage block": block}, others, mode, name="the advantage block", most=300
+            entries,
+            {"the advantage block": block},
+            others,
+            mode,
+            name="the advantage block",
+            agree=agree,
+            most=300,
         )
 
     def __call__(self, rollout: TensorDictBase) -> TensorDictBase:
