@@ -1,15 +1,17 @@
 """Two learners on gloo, each with half of the rows, against one learner with all of them."""
 
+import copy
 import socket
 from types import SimpleNamespace
 
 import pytest
+import ray
 import torch
 import torch.distributed as dist
 import torch.multiprocessing as mp
 from tensordict import TensorDict
 
-from pgkit import advantages, envs, losses, modules, updates
+from pgkit import advantages, collectors, envs, losses, modules, updates
 from pgkit.compiled import compiled
 from pgkit.errors import UserError
 from pgkit.functional import standardize
@@ -105,26 +107,62 @@ def both(tmp_path_factory):
     return [torch.load(folder / f"{rank}.pt", weights_only=False) for rank in range(2)]
 
 
-@pytest.mark.parametrize("name", CASES)
-def test_two_learners_equal_one_with_the_union_of_their_minibatches(name, both, monkeypatch):
-    def unions(rows, size, generator, device, together):
-        order = torch.randperm(rows // 2, generator=generator).split(size // 2)
-        parts = [torch.cat([index, rows // 2 + index]) for index in order]
-        yield from (tuple(parts[first : first + together]) for first in range(0, len(parts), together))
+def unions(rows, size, generator, device, together):
+    """The minibatches of two learners with half of the rows each, as one learner's."""
+    order = torch.randperm(rows // 2, generator=generator).split(size // 2)
+    parts = [torch.cat([index, rows // 2 + index]) for index in order]
+    yield from (tuple(parts[first : first + together]) for first in range(0, len(parts), together))
 
-    monkeypatch.setattr(on_policy, "minibatches", unions)
-    case = CASES[name] | {"compile": "off"}
+
+def one_learner(**case):
+    """What one learner learns from the unions, and its last rollout."""
     update, normalizer = make(**case), modules.ObsNormalizer((3,)).double()
     for i in range(ROUNDS):
         rollout = make_rollout(i, case.get("masked", False))
         metrics = update(rollout)
         normalizer.update(rollout["observation"])
-    expected, got = outcome(update, normalizer, metrics), both[0][name]
+    return outcome(update, normalizer, metrics), rollout
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_two_learners_equal_one_with_the_union_of_their_minibatches(name, both, monkeypatch):
+    monkeypatch.setattr(on_policy, "minibatches", unions)
+    expected, got = one_learner(**CASES[name] | {"compile": "off"})[0], both[0][name]
     for what in ("parameters", "optimizer", "normalizer"):
         for mine, its in zip(got[what], expected[what], strict=True):
             torch.testing.assert_close(mine, its, rtol=0, atol=1e-6)
     for metric in ("loss_objective", "loss_critic", "approx_kl", "grad_norm", "epochs"):
         assert got["metrics"][metric] == pytest.approx(expected["metrics"][metric], rel=1e-6, abs=1e-9), metric
+
+
+def test_learners_on_ray_equal_one_resume_and_say_that_one_died(monkeypatch):
+    collectors.connect(cpus=2)
+    try:
+        learners = updates.RayLearners(make(epochs=2), 2)
+        rollouts = [make_rollout(i) for i in range(ROUNDS)]
+        for rollout in rollouts:
+            metrics = learners(rollout)
+        got = outcome(learners.update, modules.ObsNormalizer((3,)), metrics)
+        learners.load_state_dict(learners.state_dict())
+        state = copy.deepcopy(learners.state_dict())
+        learners(make_rollout(2))
+        after = [p.clone() for p in learners.update.loss.parameters()]
+        learners.load_state_dict(state)
+        learners(make_rollout(2))
+        assert all(torch.equal(a, b) for a, b in zip(after, learners.update.loss.parameters(), strict=True))
+        assert learners.frames == 3 * ENVS * STEPS
+        ray.kill(learners._others[0])
+        with pytest.raises(UserError, match="learner 1 is gone"):
+            learners(make_rollout(3))
+        learners.shutdown()
+    finally:
+        ray.shutdown()
+    monkeypatch.setattr(on_policy, "minibatches", unions)
+    expected, rollout = one_learner(epochs=2)
+    for what in ("parameters", "optimizer"):
+        for mine, its in zip(got[what], expected[what], strict=True):
+            torch.testing.assert_close(mine, its, rtol=0, atol=1e-6)
+    torch.testing.assert_close(rollouts[-1]["value_target"], rollout["value_target"], rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", CASES)

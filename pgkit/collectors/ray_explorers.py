@@ -13,7 +13,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from pgkit.collectors.cluster import ray_module
+from pgkit.collectors.cluster import Waiting, ray_module
 from pgkit.files import shipped
 
 Weights = Mapping[str, Tensor]
@@ -46,6 +46,10 @@ class RayExplorers:
             None: the explorers run freely.
         seed: from which each explorer's is made; a resumed run's and a replaced actor's are others.
         niceness: of the actors, so that learner and replay go first where they share a processor.
+        wait: seconds to wait for a place in the cluster.
+
+    Raises:
+        UserError: while collecting, the cluster has no place for an explorer.
 
     Attributes:
         frames: frames collected.
@@ -65,17 +69,18 @@ class RayExplorers:
         frames_per_update: float | None = None,
         seed: int = 0,
         niceness: int = 15,
+        wait: float = 300.0,
     ) -> None:
         ray = ray_module()
         self._make = ray.put(shipped(make))
         self.explorers, self.store, self.frames_per_update = explorers, store, frames_per_update
         self.frames_per_call, self.total_frames = frames_per_call, total_frames
         self.frames = self.restarts = 0
-        self._seed, self._niceness, self._begun = seed, niceness, 0
+        self._seed, self._niceness, self._wait, self._begun = seed, niceness, wait, 0
         self._since: tuple[int, int] | None = None  # frames begun and updates where the limit began to hold
         self._weights: Any = None
         self._idle = deque[int]()
-        self._actors = dict[int, Any]()
+        self._actors, self._ready = dict[int, Any](), dict[int, Any]()
         self._running = dict[Any, tuple[int, int, Any]]()  # the call -> explorer, shard and its handle
 
     def publish(self, weights: Weights, updates: int) -> None:
@@ -96,8 +101,10 @@ class RayExplorers:
         self._begin(updates)
         calls = list(self._running)
         done = ray.wait(calls, num_returns=len(calls), timeout=0)[0] if calls else []
-        if updates is None and not done:
-            done = ray.wait(calls, num_returns=1)[0]
+        waiting = Waiting("explorers", self._wait)
+        while updates is None and not done:
+            waiting.go_on(list(self._ready.values()), 0.0)
+            done = ray.wait(calls, num_returns=1, timeout=1.0)[0]
         reports = [report for call in done if (report := self._end(call)) is not None]
         self._begin(updates)
         if not reports:
@@ -161,6 +168,7 @@ class RayExplorers:
         words = np.random.SeedSequence((self._seed, number, self.frames, self.restarts)).generate_state(1)
         start = ray_module().remote(_Explorer).options(num_cpus=1)
         self._actors[number] = start.remote(self._make, number, int(words[0] >> 1), self.frames, self._niceness)
+        self._ready[number] = self._actors[number].__ray_ready__.remote()
         self._idle.append(number)
 
 

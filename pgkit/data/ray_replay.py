@@ -70,7 +70,7 @@ class RayReplay:
         gamma: float = 1.0,
         least: int = 1,
         device: torch.device | str = "cpu",
-        timeout: float = 60.0,
+        timeout: float = 300.0,
     ) -> None:
         import ray
 

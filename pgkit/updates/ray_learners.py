@@ -33,10 +33,12 @@ class RayLearners:
         UserError: the cluster has no room for the learners; while training, a learner is gone.
     """
 
-    def __init__(self, update: OnPolicyUpdate, learners: int, *, timeout: float = 60.0) -> None:
+    def __init__(self, update: OnPolicyUpdate, learners: int, *, timeout: float = 300.0) -> None:
         import ray
         from ray import cloudpickle
 
+        if not ray.is_initialized():
+            raise UserError("the learners are actors of Ray: call pgkit.collectors.connect(cpus=...) first")
         self.update, self.learners = update, learners
         gpus = 1 if next(update.loss.parameters()).is_cuda else 0
         start = ray.remote(_Learner).options(num_cpus=1, num_gpus=gpus)
@@ -131,7 +133,7 @@ class RayLearners:
             except ray.exceptions.RayTaskError as error:
                 if isinstance(error.cause, UserError):
                     raise error.cause from error
-                if not isinstance(error.cause, dist.DistError):  # of whoever waited for the one that failed
+                if not isinstance(error.cause, RuntimeError):  # that is of who waited for the one that failed
                     raise error
             except ray.exceptions.GetTimeoutError:
                 continue
