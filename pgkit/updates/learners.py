@@ -115,7 +115,7 @@ class Learners:
         which = torch.arange(len(parts), device=order.device).repeat_interleave(sizes)
         for key in self.standardized:
             x, counts = data[key], self._mask(data, key)
-            stats = _moments(*(y[order].flatten(1) for y in (x, counts)), which, len(parts))
+            stats = _moments(*(y[order].reshape(len(order), -1) for y in (x, counts)), which, len(parts))
             _, mean, deviation = _combined(self.gather(stats[None]))
             shape = (-1, *[1] * (x.dim() - 1))
             standard = torch.empty_like(x)
@@ -123,7 +123,7 @@ class Learners:
             data = data.copy().set(key, standard)
         if masks := [data[key] for key in self.view.masks if key in data.keys(True)]:
             own = torch.zeros(len(parts), dtype=torch.float64, device=order.device)
-            own.index_add_(0, which, _together(masks)[order].flatten(1).sum(1).double())
+            own.index_add_(0, which, _together(masks)[order].reshape(len(order), -1).sum(1).double())
             ends = torch.tensor([len(batch) for batch in batches]).cumsum(0)[:-1].tolist()
             steps = torch.stack([counts.sum() for counts in own.tensor_split(ends)])
             self._shares.extend((steps / self.sum(steps.clone()).clamp_min(1)).tolist())
@@ -132,7 +132,8 @@ class Learners:
     def mean(self, results: Sequence[Tensor]) -> list[Tensor]:
         """The mean of each tensor over all learners, weighted by the rows that count: one all-reduce."""
         share = self._shares.popleft() if self._shares else 1 / self.size
-        total = self.sum(torch.cat([x.reshape(-1) for x in results]) * share)
+        own = torch.cat([x.reshape(-1) for x in results])
+        total = self.sum(own * share if share else torch.zeros_like(own))  # the mean of no rows is NaN
         parts = total.split([x.numel() for x in results])
         return [part.view(x.shape).to(x.dtype) for part, x in zip(parts, results, strict=True)]
 
