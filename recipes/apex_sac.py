@@ -92,7 +92,8 @@ class Explorer:
 
     def __init__(self, args: Args, number: int, seed: int, frames: int) -> None:
         env = args.make_env(args.num_envs, seed)
-        (low, high), place = args.noise, number / max(args.explorers - 1, 1)
+        (low, high), last = args.noise, args.explorers - 1
+        place = number / last if last else 0.5
         self.loss = (built := agent(args, env)).loss
         self.collector = collectors.VectorCollector(
             env,
@@ -102,7 +103,7 @@ class Explorer:
             compile="off",
         )
         self.rows = args.num_envs * args.steps
-        self.recent = data.ReplayBuffer(env, 2 * self.rows, n_steps=args.n_step)
+        self.recent = data.ReplayBuffer(env, 2 * self.rows, n_steps=args.n_step, final_rows=2 * self.rows)
 
     def __call__(self, weights: dict[str, Tensor]) -> TensorDictBase:
         """A rollout, with ``td_error`` for its first priorities."""

@@ -102,7 +102,7 @@ class RayExplorers:
         calls = list(self._running)
         done = ray.wait(calls, num_returns=len(calls), timeout=0)[0] if calls else []
         waiting = Waiting("explorers", self._wait)
-        while updates is None and not done:
+        while updates is None and calls and not done:
             waiting.go_on(list(self._ready.values()), 0.0)
             done = ray.wait(calls, num_returns=1, timeout=1.0)[0]
         reports = [report for call in done if (report := self._end(call)) is not None]
