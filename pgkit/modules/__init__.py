@@ -9,7 +9,7 @@ from pgkit.modules.deterministic import deterministic_actor
 from pgkit.modules.discrete import categorical_actor
 from pgkit.modules.encoders import dict_encoder
 from pgkit.modules.ensemble import EnsembleBatchRenorm, EnsembleDropout, EnsembleLayerNorm, EnsembleLinear
-from pgkit.modules.exploration import GaussianExploration, OrnsteinUhlenbeck
+from pgkit.modules.exploration import GaussianExploration, OrnsteinUhlenbeck, ScaledExploration
 from pgkit.modules.hugging_face import hugging_face, hugging_face_tokenizer
 from pgkit.modules.mlp import mlp
 from pgkit.modules.normalizers import ObsNormalizer, ReturnScale
@@ -31,6 +31,7 @@ __all__ = [
     "OrnsteinUhlenbeck",
     "QValue",
     "ReturnScale",
+    "ScaledExploration",
     "TokenActor",
     "TokenDistribution",
     "TokenPolicy",

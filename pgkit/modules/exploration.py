@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
@@ -46,6 +46,34 @@ class GaussianExploration(TensorDictModuleBase):
             action = out[self.bounds.key]
             out[self.bounds.key] = self.bounds(action, self.std * torch.randn_like(action))
         return out
+
+
+class ScaledExploration(TensorDictModuleBase):
+    r"""A Gaussian actor that draws with :math:`f` times its deviation, for one of several explorers.
+
+    With :math:`f_i = f_0^{1 - i/(N-1)} f_1^{i/(N-1)}` for explorer :math:`i` of :math:`N` they form a ladder, as the
+    :math:`\epsilon` of Ape-X do (Horgan et al., 2018, https://arxiv.org/abs/1803.00933). A squashed Gaussian is scaled
+    before the tanh. Without exploration, as in evaluation, the action is the actor's own.
+
+    Args:
+        actor: writes ``scale`` and draws from it; :func:`~pgkit.modules.tanh_normal_actor`.
+        factor: :math:`f`.
+    """
+
+    def __init__(self, actor: ProbabilisticTensorDictSequential, factor: float = 1.0) -> None:
+        super().__init__()
+        self.actor, self.factor = actor, factor
+        self.in_keys, self.out_keys = list(actor.in_keys), list(actor.out_keys)
+        self.key = next(key for key in actor[-1].in_keys if (key if isinstance(key, str) else key[-1]) == "scale")
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """The actor's result, drawn with the larger or smaller deviation."""
+        *network, draw = self.actor
+        for module in network:
+            tensordict = module(tensordict)
+        if explores():
+            tensordict[self.key] = self.factor * tensordict[self.key]
+        return draw(tensordict)
 
 
 class OrnsteinUhlenbeck(TensorDictModuleBase):

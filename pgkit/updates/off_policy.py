@@ -17,7 +17,7 @@ from pgkit.compiled import check_compile, choose, undone
 from pgkit.data import ReplayBuffer
 from pgkit.errors import UserError
 from pgkit.seams import Augmentation
-from pgkit.updates.batches import Batches, OwnBatches, TorchRLBatches
+from pgkit.updates.batches import Batches, batches_of
 from pgkit.updates.minibatches import means
 from pgkit.updates.state import load, save
 from pgkit.updates.step import GradientStep, Grads, grads_of, metrics_of
@@ -48,7 +48,8 @@ class OffPolicyUpdate:
     Args:
         loss: any TorchRL off-policy ``LossModule``; the sum of its ``loss_*`` entries is minimized. The target networks
             it holds are averaged here: no ``SoftUpdate`` besides.
-        buffer: :class:`pgkit.data.ReplayBuffer` or any TorchRL replay buffer over single transitions.
+        buffer: :class:`pgkit.data.ReplayBuffer`, :class:`pgkit.data.RayReplay` (then only :meth:`train` trains), or
+            any TorchRL replay buffer over single transitions.
         optimizer: any ``torch.optim`` optimizer; its groups may have learning rates of their own.
         batch_size: rows of a batch.
         updates_per_step: gradient steps for each frame collected; a fraction such as 0.5 adds up.
@@ -96,8 +97,7 @@ class OffPolicyUpdate:
         self.frames = self.updates = 0
         self.between: Callable[[Grads], Grads] | None = None  # changes the gradients before the optimizer's step
         self._due = 0.0
-        source = OwnBatches if isinstance(buffer, ReplayBuffer) else TorchRLBatches
-        self._batches: Batches = source(buffer, loss, batch_size * accumulate)
+        self._batches: Batches = batches_of(buffer, loss, batch_size * accumulate)
         one_tau = None if isinstance(tau, Mapping) else tau
         check_settings(LossView(loss), vars(self) | {"capacity": self._batches.capacity, "tau": one_tau})
         self._average, self._copy_statistics = averaging(loss, tau), copying(loss)
