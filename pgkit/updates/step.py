@@ -48,7 +48,7 @@ class GradientStep:
         watch: modules that ``gradients`` uses, by name, as in :func:`pgkit.compiled.compiled`.
         holds: further tensors that change in place.
         max_grad_norm: bound of the gradient's norm over all parameters; None: no bound.
-        average: moves the target networks, last.
+        after: what follows the optimizer's step: the target networks move.
         between: ``grads -> grads`` before the norm clip: the average over several learners.
         apart: keeps the two graphs apart, for a call on several minibatches.
         mode: as in :func:`pgkit.compiled.compiled`.
@@ -67,7 +67,7 @@ class GradientStep:
         watch: Mapping[str, Any],
         holds: Iterable[Tensor] = (),
         max_grad_norm: float | None = None,
-        average: Callable[[], None] | None = None,
+        after: Callable[[], None] | None = None,
         between: Callable[[Grads], Grads] | None = None,
         apart: bool = False,
         mode: Mode = "off",
@@ -87,8 +87,8 @@ class GradientStep:
                 factor = optim.computed_once((max_grad_norm / (norm + 1e-6)).clamp(max=1.0))
                 grads = [grad * factor for grad in grads]
             step(grads)
-            if average is not None:
-                average()
+            if after is not None:
+                after()
             return norm
 
         def first(data: TensorDictBase, index: Tensor) -> list[Tensor]:
