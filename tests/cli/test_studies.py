@@ -1,12 +1,16 @@
 """Experiments, reports and searches from the command line, with runs that take seconds."""
 
 import csv
+import dataclasses
+import typing
 
 import pytest
 
+from pgkit.cli import recipes, studies
 from pgkit.cli.main import main
 from pgkit.errors import UserError
 from pgkit.run import experiment, tune
+from pgkit.run.args import check, of_type
 
 SHORT = ["--total-frames", "256", "--steps", "16", "--eval-episodes", "1", "--compile", "off"]
 
@@ -96,3 +100,19 @@ def test_settings_as_flags():
     )  # fmt: skip
     with pytest.raises(UserError, match="no search space"):
         tune.tune("ppo", {}, "X-v1", trials=1, folder=None)
+
+
+@pytest.mark.parametrize("recipe", [name for name in recipes.names() if name != "grpo"])  # grpo trains on no env id
+def test_a_recipe_s_search_space_is_made_of_its_settings(recipe):
+    space = studies.search_space(recipe)
+    args = recipes.load(recipes.find(recipe)).Args
+    assert len(space) >= 4
+    for name, values in space.items():
+        hint = typing.get_type_hints(args)[name]
+        for value in values if isinstance(values, list) else values[:2]:
+            check(dataclasses.replace(args(), **{name: of_type(value, hint)}))
+        default = getattr(args(), name)
+        numbers = [x for x in values if not isinstance(x, str)]
+        assert default in values or min(numbers) <= default <= max(numbers), (
+            f"{name}: the default {default} is outside {values}"
+        )
