@@ -48,6 +48,17 @@ def test_a_failed_run_is_named_and_the_others_go_on(tmp_path, monkeypatch, capsy
     assert [row["env"] for row in rows("here/results.csv")] == ["CartPole-v1"]
 
 
+def test_runs_with_other_flags_have_other_directories(tmp_path):
+    def directories(*flags):
+        return [cell.directory for cell in experiment.cells("ppo", ["dm_control/x-v0"], [1, 2], flags, tmp_path)]
+
+    plain, other = directories(), directories("--lmbda", "0.9")
+    assert [path.name for path in plain] == ["dm_control-x-v0__1", "dm_control-x-v0__2"]
+    assert [path.name for path in other] == ["dm_control-x-v0__lmbda-0.9__1", "dm_control-x-v0__lmbda-0.9__2"]
+    long = [directories("--env.some_long_keyword_of_it", "a" * 60 + end)[0].name for end in "bc"]
+    assert long[0] != long[1] and max(map(len, long)) < 100
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
