@@ -74,6 +74,15 @@ PRESETS = {
     "dmc:*": dict(total_frames=500_000, action_repeat=2),
 }
 
+SEARCH = {
+    "learning_rate": (1e-4, 3e-3, "log"),
+    "q_learning_rate": (1e-4, 3e-3, "log"),
+    "batch_size": [128, 256, 512],
+    "exploration_noise": (0.05, 0.3),
+    "noise": ["gaussian", "ou"],
+    "tau": (0.002, 0.05, "log"),
+}
+
 
 def agent(args: Args, env: EnvBase) -> run.Agent:
     """Networks, loss and exploration."""

@@ -89,6 +89,15 @@ PRESETS = {
     ),
 }  # fmt: skip
 
+SEARCH = {
+    "learning_rate": (1e-4, 3e-3, "log"),
+    "q_learning_rate": (1e-4, 3e-3, "log"),
+    "batch_size": [64, 128, 256],
+    "target_entropy_weight": (0.3, 0.98),
+    "tau": (0.002, 0.05, "log"),
+    "updates_per_step": [0.25, 0.5, 1.0],
+}
+
 
 def agent(args: Args, env: EnvBase) -> run.Agent:
     """Networks, temperature and loss."""

@@ -95,6 +95,20 @@ PRESETS = {
     "dmc:*": dict(),
 }  # fmt: skip
 
+SEARCH = {
+    "learning_rate": (1e-4, 1e-3, "log"),
+    "anneal": [False, True],
+    "lmbda": (0.85, 0.98),
+    "gamma": [0.98, 0.99, 0.995, 0.999],
+    "steps": [128, 256, 512],
+    "minibatch_size": [32, 64, 128, 256],
+    "epochs": (5, 20),
+    "clip_epsilon": [0.1, 0.2, 0.3],
+    "entropy_coeff": [0.0, 1e-3, 1e-2],
+    "normalize_advantage": ["rollout", "minibatch", "off"],
+    "log_std": (-2.0, 0.0),
+}
+
 
 def agent(args: Args, env: EnvBase) -> run.Agent:
     """Networks, loss and advantage."""

@@ -111,6 +111,16 @@ PRESETS = {
     "dmc:*": dict(total_frames=500_000, action_repeat=2),
 }
 
+SEARCH = {
+    "learning_rate": (1e-4, 3e-3, "log"),
+    "q_learning_rate": (1e-4, 3e-3, "log"),
+    "batch_size": [128, 256, 512],
+    "tau": (0.002, 0.05, "log"),
+    "gamma": [0.98, 0.99, 0.995],
+    "critic": ["mlp", "layernorm", "crossq"],
+    "actor_delay": (1, 3),
+}
+
 VARIANTS = {
     "redq": dict(num_critics=10, subset=2, actor_value="mean", steps=1, updates_per_step=20.0, actor_delay=20),
     "droq": dict(critic="droq", actor_value="mean", steps=1, updates_per_step=20.0, actor_delay=20),

@@ -62,6 +62,8 @@ class OffPolicyUpdate:
         learning_starts: frames in the replay before the first step, at least ``batch_size``.
         accumulate: batches whose gradients add up to one optimizer step.
         augment: ``batch -> batch`` that changes a batch before the loss reads it, inside the compiled step.
+        project: called after the optimizer's step, inside the compiled step, to bring parameters of the loss back to
+            where they belong: :class:`pgkit.modules.WeightProjection`.
         max_grad_norm: bound of the gradient's norm over all parameters; None: no bound.
         total_frames: frames of the whole training, for ``compile="auto"``.
         compile: ``on``, ``off``, or ``auto`` (compile where at least 3,000 steps are expected).
@@ -84,6 +86,7 @@ class OffPolicyUpdate:
         learning_starts: int = 1_000,
         accumulate: int = 1,
         augment: Augmentation | None = None,
+        project: Callable[[], None] | None = None,
         max_grad_norm: float | None = None,
         total_frames: int | None = None,
         compile: str = "auto",
@@ -91,7 +94,7 @@ class OffPolicyUpdate:
         check_compile(compile)
         self.loss, self.buffer, self.optimizer = loss, buffer, optimizer
         self.batch_size, self.updates_per_step, self.actor_delay = batch_size, updates_per_step, actor_delay
-        self.delay_targets, self.accumulate, self.augment = delay_targets, accumulate, augment
+        self.delay_targets, self.accumulate, self.augment, self.project = delay_targets, accumulate, augment, project
         self.tau, self.learning_starts, self.max_grad_norm = tau, learning_starts, max_grad_norm
         self.total_frames, self.compile = total_frames, compile
         self.frames = self.updates = 0
@@ -206,6 +209,11 @@ class OffPolicyUpdate:
             grads = grads_of(out, params, only)
             return metrics_of(out, names, like=grads[0]), grads
 
+        def after() -> None:
+            for change in (self.project, self._average if average else None):
+                if change is not None:
+                    change()
+
         steps = None if self.total_frames is None else self.total_frames * self.updates_per_step
         return GradientStep(
             gradients,
@@ -215,7 +223,7 @@ class OffPolicyUpdate:
             watch={"the loss": self.loss, "the augmentation": self.augment},
             holds=self._batches.written(),
             max_grad_norm=self.max_grad_norm,
-            average=self._average if average else None,
+            after=after,
             between=self.between,
             apart=self.accumulate > 1,
             # a step costs 10 times a PPO step, so compiling pays 10 times sooner

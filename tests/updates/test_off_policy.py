@@ -509,3 +509,18 @@ def test_a_term_that_trains_the_critics_alone_is_not_delayed_with_the_actor():
     update.train(1)
     between = update.train(1)
     assert {name for name in between if name.startswith("loss_")} == {"loss_qvalue", "loss_conservative"}
+
+
+def test_projection_follows_the_optimizer_and_comes_before_the_targets():
+    seen = []
+    update, collector = agent(project=lambda: seen.append("projected"), updates_per_step=0.25)
+    update._average = lambda: seen.append("averaged")
+    train(update, collector, rollouts=3)
+    assert update.updates == 16 and seen == ["projected", "averaged"] * 16
+
+    projection = []
+    update, collector = agent(project=lambda: projection[0](), updates_per_step=0.25)
+    projection.append(modules.WeightProjection(update.loss.actor_network))
+    train(update, collector, rollouts=3)
+    weight = update.loss.actor_network_params["module", "0", "module", "0", "0", "weight"]
+    torch.testing.assert_close(weight.norm(dim=-1), torch.ones(len(weight)))
