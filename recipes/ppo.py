@@ -12,6 +12,7 @@ import torch
 from torchrl.envs import EnvBase
 
 from pgkit import advantages, collectors, controllers, losses, modules, run, updates
+from pgkit.errors import UserError
 
 
 @dataclass
@@ -68,6 +69,8 @@ class Args(run.RunArgs):
     """With a memory: steps of a sequence, which gradients flow through; minibatches are made of whole ones."""
     collector: Literal["pgkit", "torchrl"] = "pgkit"
     """pgkit's VectorCollector, or TorchRL's Collector: one process, and new episodes on a resume."""
+    overlap: bool = False
+    """Collect the next rollout in other processes while this one updates: its weights are one update old."""
 
 
 PRESETS = {
@@ -153,13 +156,18 @@ def main(args: Args) -> None:
         )
         sizes = {"frames_per_batch": args.num_envs * args.steps, "total_frames": args.total_frames}
         if args.collector == "pgkit":
-            collector = collectors.VectorCollector(env, built.actor, **sizes, compile=args.compile)
+            make_collector = collectors.AsyncCollector if args.overlap else collectors.VectorCollector
+            collector = make_collector(env, built.actor, **sizes, compile=args.compile)
+        elif args.overlap:
+            raise UserError("--overlap: TorchRL's Collector waits for the update; leave --collector at pgkit")
         else:
             collector = collectors.TorchRLCollector(env, built.actor, **sizes)
 
         log.track(agent=built, eval_env=args.make_env, update=update, collector=collector)
         for rollout in collector:
             metrics = update(rollout)
+            if args.overlap:
+                metrics["policy_lag"] = collector.lag
             if built.normalizer is not None:
                 built.normalizer.update(rollout["observation"])
             if built.scale is not None:
