@@ -29,6 +29,8 @@ class Options(contest.Options):
 
     frames: int = 5000
     warmup: int = RANDOM_FRAMES + 1000
+    replay: bool = True
+    """Also time the parts of replay and update; they compile two more graphs."""
 
 
 def agent(seed: int, stored: int = 0, sampler: Any = None) -> tuple[Any, Any, Any]:
@@ -194,7 +196,8 @@ if __name__ == "__main__":
     times, most = " to ".join(f"{ms:.2f}" for ms in sorted(alone.values())), 1e3 / min(alone.values())
     print(f"\nfloor, {threads} thread(s): the matmuls of one update ({gflop:.2f} GFLOP) take {times} ms", end=" ")
     print(f"(before and after the rounds): at most {most:.0f} updates/s")
-    replays = {name: replay(threads, name == "prioritized") for name in ("uniform", "prioritized")}
+    kinds = ("uniform", "prioritized") if options.replay else ()
+    replays = {name: replay(threads, name == "prioritized") for name in kinds}
     for name, ms in replays.items():
         total = ms["write"] + ms["draw"] + ms["step"]
         share = (total - ms["step without gather"]) / total
