@@ -74,9 +74,9 @@ def _forward(x: Any, weight: Any, bias: Any, *rest: Any) -> Any:
 
 
 def _backward(grad: Any, x: Any, weight: Any, sizes: Any, *rest: Any) -> list[Any]:
-    *rest, wanted = rest
+    *form, wanted = rest
     only = [wanted[0], wanted[1], False]
-    made = _aten.convolution_backward.default(_half(grad), _half(x), _half(weight), None, *rest, only)
+    made = _aten.convolution_backward.default(_half(grad), _half(x), _half(weight), None, *form, only)
     results = [_whole(made[at]) if wanted[at] else None for at in range(2)]
     return [*results, _aten.sum.dim_IntList(grad, [0, 2, 3]) if wanted[2] else None]
 
