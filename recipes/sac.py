@@ -52,12 +52,12 @@ class Args(run.RunArgs):
     """Env steps to train for, all envs together; with action_repeat, decisions."""
     num_envs: int = 1
     """Envs stepped side by side."""
-    threads: int = 2
-    """Threads that PyTorch uses in this process; 2 is faster than 1 for networks 256 wide."""
+    threads: int = 0
+    """Threads that PyTorch uses in this process; 0: 1 or 2, whichever a measurement at the start finds faster."""
     steps: int = run.setting(16, low=1)
     """Steps each env takes before as many updates; 1 is the papers' schedule."""
-    asynchronous: bool = False
-    """Collect in another process while this one updates: rollouts are one update old, see train/policy_lag."""
+    overlap: bool = False
+    """Collect the next rollout in other processes while this one updates: its weights are one update old."""
     random_frames: int = run.setting(1_000, low=0)
     """Frames with random actions before updates begin; a run no longer than that has a batch of them."""
     batch_size: int = run.setting(256, low=1)
@@ -202,7 +202,7 @@ def main(args: Args) -> None:
             total_frames=args.total_frames,
             compile=args.compile,
         )
-        make_collector = collectors.AsyncCollector if args.asynchronous else collectors.VectorCollector
+        make_collector = collectors.AsyncCollector if args.overlap else collectors.VectorCollector
         collector = make_collector(
             env,
             built.actor,
@@ -218,7 +218,7 @@ def main(args: Args) -> None:
             if built.normalizer is not None:
                 built.normalizer.update(rollout["observation"])
             metrics = update(rollout)
-            if args.asynchronous:
+            if args.overlap:
                 metrics["policy_lag"] = collector.lag
             log.step(collector.frames, rollout, metrics, every=args.log_every)
         collector.shutdown()

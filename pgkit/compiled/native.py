@@ -18,6 +18,7 @@ from torch.fx import GraphModule, Node
 from torch.fx.experimental.proxy_tensor import make_fx
 from torch.fx.subgraph_rewriter import replace_pattern
 
+from pgkit.compiled.convolutions import halve_convolutions
 from pgkit.compiled.products import as_they_are, fastest_products
 
 # the same random numbers as eager code
@@ -127,6 +128,7 @@ def compile_record(graph: GraphModule, inputs: Sequence[Tensor]) -> Callable[...
 
     (results,) = graph.graph.output_node().args
     fastest_products(graph)
+    halve_convolutions(graph)
     constants = _as_inputs(graph)
     tensors, options = [*inputs, *constants], _OPTIONS
     if all(x.device.type == "cpu" for x in tensors):

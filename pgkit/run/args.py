@@ -85,8 +85,8 @@ class RunArgs:
     """Go on with --run-dir where it has a checkpoint, else begin there: one command for a run that is stopped."""
     trust: bool = setting(False, on_resume=True)
     """Import the modules that a run directory names: its environment's and its wrapper's."""
-    threads: int = setting(1, low=1, high=256, on_resume=True)
-    """Threads that PyTorch uses in this process; 1 is fastest for small networks."""
+    threads: int = setting(1, low=0, high=256, on_resume=True)
+    """Threads that PyTorch uses in this process; 1 is fastest for small networks; 0: 1 or 2, measured at the start."""
     explain: bool = setting(False, on_resume=True)
     """Print how the agent is wired (who writes and who reads each entry), and end before training."""
 

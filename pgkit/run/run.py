@@ -31,6 +31,7 @@ from pgkit.run.evaluate import evaluate
 from pgkit.run.metrics import Metrics, averages, digest, finished_episodes, finished_infos
 from pgkit.run.plots import plot
 from pgkit.run.progress import Live
+from pgkit.run.threads import fastest_threads
 from pgkit.seams import Stateful
 
 NAN = float("nan")
@@ -88,6 +89,7 @@ class Run:
             except BaseException:
                 directory.unlock(self._lock)
                 raise
+        self.args.threads = self.args.threads or fastest_threads()
         torch.set_num_threads(self.args.threads)
         set_matmul(self.args.matmul)
         seeding.seed_everything(self.args.seed)
