@@ -19,6 +19,7 @@ from pgkit.envs.agents import Names
 from pgkit.envs.gym_list import Gymnasium
 from pgkit.envs.gym_vector import GymnasiumVector
 from pgkit.envs.ids import is_atari, make_one, rendered
+from pgkit.envs.limits import limited
 from pgkit.envs.numpy_entries import Info
 from pgkit.envs.parallel import Parallel, is_parallel, refuse_turns
 from pgkit.envs.pixels import FrameStack, Pixels
@@ -43,6 +44,7 @@ class Settings(NamedTuple):
     fast_render: bool = False
     reward_clipping: bool = False
     groups: Names | None = None
+    env_timeout: float | None = None
 
 
 def make(
@@ -61,6 +63,8 @@ def make(
     fast_render: bool = False,
     reward_clipping: bool | None = None,
     groups: Names | None = None,
+    env_timeout: float | None = None,
+    restart_workers: bool = False,
     **kwargs: Any,
 ) -> VectorEnv:
     """Makes a vector of environments.
@@ -84,6 +88,10 @@ def make(
         max_episode_steps: time limit; None: the id's own (VMAS's: 100), which a function or class has none of.
         groups: of many agents, their names by the name of their group; None: one group, or by the beginnings of their
             names where their spaces differ.
+        env_timeout: seconds that one step of a process's environments may take; None: any time.
+        restart_workers: a worker process that has ended or hangs is replaced. Its environments go on where they were,
+            those that cannot (:attr:`~pgkit.seams.Simulator.resume`) begin new episodes. It costs the state of every
+            environment with every rollout.
         **kwargs: passed to ``gymnasium.make``, to the dm_control task, or to the function or class.
 
     Raises:
@@ -103,7 +111,7 @@ def make(
             what = f"workers={workers}" if workers > 1 else f"{next(iter(kwargs))}=..."
             raise UserError(f"{what} with an environment that is made already: give a function that makes one")
         images = (pixels, stack, fast_render, clips)
-        given = Settings(device, action_repeat, flatten, info, max_episode_steps, *images, groups)
+        given = Settings(device, action_repeat, flatten, info, max_episode_steps, *images, groups, env_timeout)
         return _adopt(env_id, num_envs, seed, given)
     num_envs = 1 if num_envs is None else num_envs
     if num_envs < 1 or workers < 1 or workers > num_envs:
@@ -119,9 +127,11 @@ def make(
     elif isinstance(env_id, str) and pixels is not None:
         kwargs = rendered(env_id, pixels) | kwargs
     images = (None if atari else pixels, stack, fast_render, clips)
-    settings = Settings(device, action_repeat, flatten, info, None if limited else max_episode_steps, *images, groups)
+    steps = None if limited else max_episode_steps
+    settings = Settings(device, action_repeat, flatten, info, steps, *images, groups, env_timeout)
     function = _function(env_id, kwargs)
-    env = VectorEnv(partial(_share, function, settings), num_envs, seed, workers)
+    env = VectorEnv(partial(_limited, function, settings), num_envs, seed, workers)
+    env.env_timeout, env.restart_workers = env_timeout, restart_workers
     env.env_id = env_id if isinstance(env_id, str) else getattr(env_id, "__qualname__", type(env_id).__name__)
     if action_repeat > 1:
         env.env_id += f" (action repeat {action_repeat})"
@@ -148,7 +158,10 @@ def _adopt(env: EnvBase | GymVectorEnv, num_envs: int | None, seed: int, setting
     """An environment that is there already."""
     if isinstance(env, VectorEnv):
         raise UserError("envs.make was given what envs.make gives: use it as it is")
-    adopted = VectorEnv(lambda first, count, seed: _simulator(env, seed, first, settings), 1, seed, splits=False)
+    adopted = VectorEnv(
+        lambda first, count, seed: limited(_simulator(env, seed, first, settings), settings.env_timeout),
+        1, seed, splits=False,
+    )  # fmt: skip
     if num_envs not in (None, adopted.num_envs):
         raise UserError(f"num_envs={num_envs}: the {type(env).__name__} given is {adopted.num_envs}: leave it out")
     adopted.env_id = type(env).__name__
@@ -166,6 +179,11 @@ def _function(env_id: Any, kwargs: dict[str, Any]) -> Callable[..., Any]:
             f"TorchRL EnvBase, this is a {type(env_id).__name__}: envs.make(lambda: ...)"
         )
     return partial(env_id, **kwargs)
+
+
+def _limited(function: Callable[..., Any], settings: Settings, first: int, count: int, seed: int) -> Simulator:
+    """As :func:`_share`, with the limit on the time of a step."""
+    return limited(_share(function, settings, first, count, seed), settings.env_timeout)
 
 
 def _share(function: Callable[..., Any], settings: Settings, first: int, count: int, seed: int) -> Simulator:

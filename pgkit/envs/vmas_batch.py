@@ -13,6 +13,7 @@ from torch import Tensor
 from torchrl.data import Composite
 
 from pgkit.envs.agents import Group, Names, groups_of, rewards, under
+from pgkit.envs.failures import FAILURES, fail, in_vector
 from pgkit.envs.numpy_entries import flags
 from pgkit.envs.seeding import episode_seed
 from pgkit.envs.spaces import to_env
@@ -161,8 +162,11 @@ class Vmas:
             x = x if bounds is None else x.clamp(*bounds)
             for i, agent in zip(own, x.unbind(1), strict=True):
                 actions[i] = agent.clone()
-        with self._stream:
-            observed, rewarded, terminated, _ = self.env.step(actions)
+        try:
+            with self._stream:
+                observed, rewarded, terminated, _ = self.env.step(actions)
+        except FAILURES as error:
+            fail(in_vector(self.env.scenario, 0, self.num_envs, self._steps + 1, self.seed), error)
         self._steps += 1
         reward = self._grouped([x.view(-1, 1) for x in rewarded], "reward")
         goes_on = ~self._begun
@@ -194,10 +198,10 @@ class Vmas:
     @torch.no_grad()
     def load_state_dict(self, state: dict[str, Any]) -> Entries:
         """Goes on exactly, or begins new episodes with a seed of their own."""
-        begins = self.resume == "new episodes" and state["steps"]
-        self._restart(episode_seed(state["seed"], 0, state["steps"]) if begins else state["seed"])
-        self.seed = state["seed"]
-        if self.resume == "new episodes":
+        exact, seed = self.resume == "exact" and "held" in state, state.get("seed", self.seed)
+        self._restart(seed if exact or not state["steps"] else episode_seed(seed, 0, state["steps"]))
+        self.seed = seed
+        if not exact:
             self._begin_counts()
             self._steps = state["steps"]
             return self._fresh
