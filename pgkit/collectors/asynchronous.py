@@ -99,6 +99,10 @@ class AsyncCollector:
 
     def rollout(self) -> TensorDictBase:
         """The next rollout, and an order for the one after it."""
+        if not all(workers.is_open for workers in self._groups):  # one has failed
+            state = self.state_dict()
+            self.shutdown()
+            self.load_state_dict(state)
         if not self._groups:
             self._start()
             for group in range(len(self._groups)):
