@@ -44,6 +44,13 @@ class EnvironmentHung(EnvironmentFailed):
     """An environment took longer than it may."""
 
 
+def interrupt_behind(error: BaseException | None) -> KeyboardInterrupt | None:
+    """The interrupt that an error comes of: ``with params.to_module(...)`` turns one into a RuntimeError."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error
+
+
 def frames_of(trace: TracebackType | None) -> str:
     """A traceback as text: the user's own frames where the error was raised there or below, or else all."""
     frames = traceback.extract_tb(trace)

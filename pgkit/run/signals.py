@@ -10,7 +10,8 @@ from collections.abc import Callable
 from types import FrameType
 from typing import Any
 
-SIGNALS = [s for s in signal.Signals if s.name in ("SIGINT", "SIGTERM", "SIGHUP")]
+from pgkit.collectors.serving import STOPS
+from pgkit.errors import interrupt_behind
 
 
 class Signals:
@@ -38,7 +39,7 @@ class Signals:
     def listen(self) -> None:
         """Hears the signals from now on, in the main thread; one that is ignored, as by ``nohup``, stays ignored."""
         if threading.current_thread() is threading.main_thread():
-            heard = [s for s in SIGNALS if s.name == "SIGINT" or signal.getsignal(s) != signal.SIG_IGN]
+            heard = [s for s in STOPS if s.name == "SIGINT" or signal.getsignal(s) != signal.SIG_IGN]
             self._handlers = {s: signal.signal(s, self._hear) for s in heard}
         self._exit, pid = os._exit, os.getpid()
 
@@ -56,11 +57,8 @@ class Signals:
         os._exit = self._exit
 
     def behind(self, error: BaseException | None) -> bool:
-        """Whether an error comes of an interrupt: ``with params.to_module(...)`` turns one into a RuntimeError."""
-        seen = error
-        while seen is not None and not isinstance(seen, KeyboardInterrupt):
-            seen = seen.__cause__ or seen.__context__
-        return error is not None and (seen is not None or self.forced)
+        """Whether an error comes of an interrupt."""
+        return error is not None and (self.forced or interrupt_behind(error) is not None)
 
     def _hear(self, number: int, frame: FrameType | None) -> None:
         again, self.asked = self.asked, True

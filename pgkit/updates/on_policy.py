@@ -18,6 +18,7 @@ from pgkit.errors import UserError
 from pgkit.functional import standardize
 from pgkit.optim import parameters
 from pgkit.seams import Augmentation
+from pgkit.updates.interrupts import interruptible
 from pgkit.updates.minibatches import means, minibatches
 from pgkit.updates.sequences import as_rows
 from pgkit.updates.state import load, save
@@ -108,6 +109,7 @@ class OnPolicyUpdate:
         self._plan: Plan | None = None
         check_settings(self._view, vars(self))
 
+    @interruptible
     def __call__(self, rollout: TensorDictBase) -> dict[str, float]:
         """Trains on a rollout ``[num_envs, T]``; metrics are means over the minibatches.
 
