@@ -65,8 +65,11 @@ class Workers:
         compile: Mode,
         bounds: Sequence[int] | None = None,
     ) -> None:
-        self._actor = copy.deepcopy(actor).requires_grad_(False).share_memory()
-        self._buffers = {key: x.share_memory_() for key, x in allocate(steps, env, outputs).items()}
+        try:
+            self._actor = copy.deepcopy(actor).requires_grad_(False).share_memory()
+            self._buffers = {key: x.share_memory_() for key, x in allocate(steps, env, outputs).items()}
+        except RuntimeError as error:
+            raise UserError(f"the workers' rollouts need shared memory: {str(error).splitlines()[0]}") from error
         self._env, self._bounds, self._step, self.episodes_lost = env, list(bounds or shares(env)), 0, 0
         make = cloudpickle.dumps(env.make)
         self._orders = [
@@ -83,10 +86,15 @@ class Workers:
         self.close = Finalize(self, stop, (self.pipes, self._processes), exitpriority=10)
         self._asked: list[Request | None] = [None] * len(self._orders)  # whose answer is not read yet
         self._states: list[bytes | None] = [None] * len(self._orders)  # as of the last rollout, if any is replaced
-        for i in range(len(self._orders)):
-            self._start(i)
         try:
+            for i in range(len(self._orders)):
+                self._start(i)
             self._answers()  # the processes are up
+        except OSError as error:
+            raise UserError(
+                f"{len(self._orders)} worker processes cannot be started: {error.strerror}; give fewer --workers, or "
+                "raise the limit (ulimit)"
+            ) from error
         except WorkerEnded as error:
             raise UserError(
                 "a collector worker ended before it began: what starts workers in a script belongs inside "

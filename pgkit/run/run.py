@@ -317,7 +317,8 @@ class Run:
             self._saved_at = self.frames
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None):
-        stopped = self._signals.behind(error)
+        # after a signal, any error may be of what else it ended: a compiler, a server of the environment's
+        stopped = error is not None and (self._signals.asked or self._signals.broke_off(error))
         try:
             self._end(error, trace, stopped)
         finally:
@@ -334,7 +335,7 @@ class Run:
         try:
             if error is None:
                 self._finish()
-            elif not stopped:
+            elif not self._signals.broke_off(error):
                 self._rescue(error, trace)
         finally:
             self._live.close()
@@ -382,5 +383,5 @@ class Run:
             self._metrics.write({"frames": self.frames, "time/wall_s": self._clock.wall, **scores})
         if self._saved_at != self.frames:
             self.save()
-        ending.write_summary(self.dir, self.args, self.recipe, self._clock.wall, self._evaluated, self.best)
         plot([self.dir], self.dir / "curve.png")
+        ending.write_summary(self.dir, self.args, self.recipe, self._clock.wall, self._evaluated, self.best)  # the last

@@ -56,9 +56,9 @@ class Signals:
             signal.signal(number, handler)
         os._exit = self._exit
 
-    def behind(self, error: BaseException | None) -> bool:
-        """Whether an error comes of an interrupt."""
-        return error is not None and (self.forced or interrupt_behind(error) is not None)
+    def broke_off(self, error: BaseException | None) -> bool:
+        """Whether an error is an interrupt, or comes of one."""
+        return self.forced or interrupt_behind(error) is not None
 
     def _hear(self, number: int, frame: FrameType | None) -> None:
         again, self.asked = self.asked, True

@@ -1,6 +1,7 @@
 """Environments that raise, exit or hang, and processes that end: named, survived, and nothing left behind."""
 
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -17,7 +18,7 @@ from pgkit import collectors, envs, modules
 from pgkit.collectors.workers import WorkerEnded
 from pgkit.envs import gym_list
 from pgkit.envs.seeding import episode_seed
-from pgkit.errors import EnvironmentFailed, EnvironmentHung
+from pgkit.errors import EnvironmentFailed, EnvironmentHung, UserError
 from tests.faulty import Faulty
 
 
@@ -248,3 +249,18 @@ def test_the_history_of_an_endless_episode_is_bounded(monkeypatch: pytest.Monkey
     fresh = again.load_state_dict(state)["observation"]
     assert fresh[0].tolist() == simulator._fresh.tensors["observation"][0].tolist() and fresh[1, 0] == 0
     assert fresh[1, 1] == pytest.approx(np.random.default_rng(episode_seed(3, 1, 1)).uniform())
+
+
+@pytest.mark.fault(kind=20, injected="too few open files for workers (ulimit -n)", outcome="one line")
+@pytest.mark.parametrize("spare", [1, 8, 18])
+def test_too_few_files_for_workers_is_one_line(spare: int):
+    collector = make(workers=2)
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (len(os.listdir("/proc/self/fd")) + spare, hard))
+    try:
+        with pytest.raises(
+            UserError, match=r"(worker processes cannot be started|need shared memory): .*oo many open f"
+        ):
+            collector.rollout()
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
