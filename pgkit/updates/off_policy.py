@@ -18,6 +18,7 @@ from pgkit.data import ReplayBuffer
 from pgkit.errors import UserError
 from pgkit.seams import Augmentation
 from pgkit.updates.batches import Batches, batches_of
+from pgkit.updates.interrupts import interruptible
 from pgkit.updates.minibatches import means
 from pgkit.updates.state import load, save
 from pgkit.updates.step import GradientStep, Grads, grads_of, metrics_of
@@ -106,6 +107,7 @@ class OffPolicyUpdate:
         self._average, self._copy_statistics = averaging(loss, tau), copying(loss)
         self._plan: Plan | None = None
 
+    @interruptible
     def __call__(self, rollout: TensorDictBase) -> dict[str, float]:
         """Stores a rollout ``[num_envs, T]`` and trains; metrics are means over the steps, none if none was due."""
         self._batches.extend(rollout)
@@ -126,6 +128,7 @@ class OffPolicyUpdate:
         self._due -= count
         return self.train(count)
 
+    @interruptible
     def train(self, updates: int) -> dict[str, float]:
         """So many gradient steps on what is stored."""
         results: dict[GradientStep, list[Tensor]] = {}
