@@ -122,7 +122,7 @@ class Block(nn.Module):
             key, value = cache.extend(layer, key, value)
         y = F.scaled_dot_product_attention(query, key, value, attend)
         x = x + self.out(y.transpose(1, 2).flatten(2))
-        return x + self.down(F.relu(self.up(self.perceptron_norm(x))).square())
+        return x + self.down(F.gelu(self.up(self.perceptron_norm(x))))
 
 
 def rotate(x: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
