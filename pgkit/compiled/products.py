@@ -147,9 +147,7 @@ def _kernels() -> dict[str, Callable[[Any, Any, torch.Size], Any]]:
 
 
 def _torch(x: Any, y: Any, shape: torch.Size) -> Any:
-    if len(shape) == 3:
-        return _aten.bmm.default(x, y)
-    return _aten.squeeze.dim(_aten.bmm.default(_aten.unsqueeze.default(x, 0), _aten.unsqueeze.default(y, 0)), 0)
+    return _aten.bmm.default(x, y) if len(shape) == 3 else _aten.mm.default(x, y)
 
 
 def _onednn(linear: Any, x: Any, y: Any, shape: torch.Size) -> Any:
