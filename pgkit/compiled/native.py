@@ -55,7 +55,7 @@ def _mask_in_place(graph: GraphModule) -> None:
             views += [pick] if pick.target is aten.view.default else []  # of one picked element, without its dimension
             (pick,) = _with_dimensions(pick)
         same = pick.target is aten.index.Tensor and pick.args[1] == masks and len(pick.users) == 1
-        if not (same and _is_mask(masks, x) and pick.args[0].meta["val"].shape == x.meta["val"].shape):
+        if not (same and _is_mask(masks, x) and cast(Node, pick.args[0]).meta["val"].shape == x.meta["val"].shape):
             continue
         with graph.graph.inserting_before(pick):
             whole = graph.graph.call_function(aten.clone.default, (pick.args[0],))

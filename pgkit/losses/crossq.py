@@ -38,21 +38,17 @@ class CrossQLoss(SoftQLoss):
     Args:
         actor_network: as in :class:`~pgkit.losses.SACLoss`.
         qvalue_network: likewise.
-        delay_qvalue: use delayed critics in the target.
-        settings: the other settings of :class:`~pgkit.losses.SoftQLoss`, but ``delay_actor``.
+        settings: the other settings of :class:`~pgkit.losses.SoftQLoss`, but ``delay_actor``; ``delay_qvalue`` is off by
+            default.
 
     Writes what ``SACLoss`` writes.
     """
 
     def __init__(
-        self,
-        actor_network: TensorDictModule,
-        qvalue_network: Critics,
-        *,
-        delay_qvalue: bool = False,
-        **settings: Unpack[SoftSettings],
+        self, actor_network: TensorDictModule, qvalue_network: Critics, **settings: Unpack[SoftSettings]
     ) -> None:
-        super().__init__(actor_network, qvalue_network, delay_actor=False, delay_qvalue=delay_qvalue, **settings)
+        settings.setdefault("delay_qvalue", False)
+        super().__init__(actor_network, qvalue_network, delay_actor=False, **settings)
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
