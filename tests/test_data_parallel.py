@@ -25,7 +25,7 @@ CASES = {  # of an update over 52 rows a learner: minibatches of 20, 20 and 12
     "masked minibatch": dict(masked=True),
     "own": dict(normalize=False, normalize_advantage=True, minibatch_size=None),
     "stopped": dict(target_kl=1e-6, epochs=8, lr=0.02),
-    "compiled": dict(compile="on", epochs=1),
+    "compiled": dict(compile="on", epochs=2),
 }
 
 

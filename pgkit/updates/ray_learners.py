@@ -78,8 +78,9 @@ class RayLearners:
         except Exception as error:
             self._explain(made)
             raise error
-        for key in results[0].keys(True, True):
-            rollout.set(key, torch.cat([results[0][key], *(torch.tensor(x[key]) for x in results[1:])]))
+        first, *rest = results
+        for key, mine in first.items(True, True):
+            rollout.set(key, torch.cat([mine, *(torch.tensor(x[key], device=mine.device) for x in rest)]))
         return metrics
 
     def __str__(self) -> str:
