@@ -94,6 +94,7 @@ PRESETS = {
     ),
     "HalfCheetah-*": dict(lmbda=0.9),
     "Hopper-*": dict(learning_rate=2e-4, anneal=True),
+    "Swimmer-*": dict(gamma=0.9999),
     "dm_control/*": dict(),
     "dmc:*": dict(),
 }  # fmt: skip

@@ -45,7 +45,7 @@ def report(
     rows = [row for table in tables for row in _present(table)]
     curves = [r for t in tables for r in experiment.read(t.with_name(f"{t.stem}-curves.csv"), experiment.CURVE)]
     scores = by_task(rows)
-    parts = markdown(scores, rows, _others(published))
+    parts = markdown(scores, rows, others(published))
     if reach:
         parts.append(time_to_score(curves, reach))
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -69,7 +69,7 @@ def report(
     return text
 
 
-def _others(published: Path | None) -> dict[tuple[str, Group], str]:
+def others(published: Path | None) -> dict[tuple[str, Group], str]:
     """What others report, by environment and group."""
     if published is None:
         return {}

@@ -63,7 +63,7 @@ class OffPolicyUpdate:
         learning_starts: frames in the replay before the first step, at least ``batch_size``.
         accumulate: batches whose gradients add up to one optimizer step.
         augment: ``batch -> batch`` that changes a batch before the loss reads it, inside the compiled step.
-        project: called after the optimizer's step, inside the compiled step, to bring parameters of the loss back to
+        project: called with the parameters that a step has trained, inside the compiled step, to bring them back to
             where they belong: :class:`pgkit.modules.WeightProjection`.
         max_grad_norm: bound of the gradient's norm over all parameters; None: no bound.
         total_frames: frames of the whole training, for ``compile="auto"``.
@@ -87,7 +87,7 @@ class OffPolicyUpdate:
         learning_starts: int = 1_000,
         accumulate: int = 1,
         augment: Augmentation | None = None,
-        project: Callable[[], None] | None = None,
+        project: Callable[[Sequence[Tensor]], None] | None = None,
         max_grad_norm: float | None = None,
         total_frames: int | None = None,
         compile: str = "auto",
@@ -213,9 +213,10 @@ class OffPolicyUpdate:
             return metrics_of(out, names, like=grads[0]), grads
 
         def after() -> None:
-            for change in (self.project, self._average if average else None):
-                if change is not None:
-                    change()
+            if self.project is not None:
+                self.project(params)
+            if average and self._average is not None:
+                self._average()
 
         steps = None if self.total_frames is None else self.total_frames * self.updates_per_step
         return GradientStep(
