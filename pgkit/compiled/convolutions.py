@@ -61,8 +61,9 @@ def _replace(node: Node, made: Any) -> None:
     """The result in place of the node, or the results in place of those that are picked from it."""
     pairs = [(node, made)] if isinstance(made, Proxy) else [(pick, made[pick.args[1]]) for pick in list(node.users)]
     for old, new in pairs:
-        old.replace_all_uses_with(new.node)
-        new.node.meta["val"] = old.meta["val"]
+        if new is not None:  # a gradient that nobody reads
+            old.replace_all_uses_with(new.node)
+            new.node.meta["val"] = old.meta["val"]
         if old is not node:
             node.graph.erase_node(old)
     node.graph.erase_node(node)
