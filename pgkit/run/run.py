@@ -320,7 +320,8 @@ class Run:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None):
         # after a signal, any error may be of what else it ended: a compiler, a server of the environment's
-        stopped = error is not None and (self._signals.asked or self._signals.broke_off(error))
+        asked = self._signals.asked and not isinstance(error, Diverged)
+        stopped = error is not None and (asked or self._signals.broke_off(error))
         try:
             self._end(error, trace, stopped)
         finally:

@@ -311,18 +311,18 @@ def test_a_second_ctrl_c_stays_an_interrupt_inside_to_module(kit: SimpleNamespac
 
 
 @pytest.mark.fault(
-    kind=21, injected="SIGTERM to the process group while compiling", outcome="saved after the first update"
+    kind=21, injected="SIGTERM to the process group while compiling", outcome="the run ends; the same command goes on"
 )
 def test_a_signal_while_compiling(nursery: Nursery, tmp_path: Path):
-    argv = shlex.split("--env-id tests.faulty:Faulty-v0 --trust --num-envs 2 --total-frames 1000 --run-dir r")
+    argv = shlex.split("--env-id tests.faulty:Faulty-v0 --trust --num-envs 2 --total-frames 100 --run-dir r")
     pid = nursery.start("compiles", argv, tmp_path / "a")
     end = time.monotonic() + 60
     while not compiling(pid) and time.monotonic() < end:
         time.sleep(0.01)
     for _ in range(2):
         os.killpg(pid, signal.SIGTERM)
-    assert nursery.end() == 130, (tmp_path / "a/out.txt").read_text()
-    assert latest(tmp_path / "a")["frames"] == int(rows(tmp_path / "a")[-1][0])
+    assert nursery.end() == 130, (tmp_path / "a/out.txt").read_text()  # the compiler was ended, too
+    assert nursery.run("compiles", [*argv, "--resume-if-possible"], tmp_path / "a") == 0
 
 
 def compiling(group: int) -> bool:
