@@ -38,8 +38,8 @@ class CrossQLoss(SoftQLoss):
     Args:
         actor_network: as in :class:`~pgkit.losses.SACLoss`.
         qvalue_network: likewise.
-        settings: the other settings of :class:`~pgkit.losses.SoftQLoss`, but ``delay_actor``; ``delay_qvalue`` is off by
-            default.
+        settings: the other settings of :class:`~pgkit.losses.SoftQLoss`, but ``delay_actor``; ``delay_qvalue`` is
+            off by default.
 
     Writes what ``SACLoss`` writes.
     """
