@@ -97,8 +97,7 @@ def make(
             is a ``UserError``.
         env_timeout: seconds that one step of a process's environments may take; None: any time.
         restart_workers: a worker process that has ended or hangs is replaced. Its environments go on where they were,
-            those that cannot (:attr:`~pgkit.seams.Simulator.resume`) begin new episodes. It costs the state of every
-            environment with every rollout.
+            those that cannot (:attr:`~pgkit.seams.Simulator.resume`) begin new episodes.
         **kwargs: passed to ``gymnasium.make``, to the dm_control task, or to the function or class.
 
     Raises:
