@@ -61,7 +61,7 @@ def test_an_error_names_the_environment_its_step_and_its_seed(workers: int, deed
     with pytest.raises(EnvironmentFailed, match=r"^environment 1 \(Faulty\), " + message) as raised:
         collector.rollout()
     assert f"seed={episode_seed(3, 1, 1)}" in raised.value.line
-    assert "test_faults.py" in raised.value.frames and "pgkit/envs" not in raised.value.frames
+    assert "tests/faulty.py" in raised.value.frames and "pgkit/envs" not in raised.value.frames
     state, again = collector.state_dict(), make(workers=3 - workers)
     again.load_state_dict(state)
     assert state["frames"] == again.frames == 16
