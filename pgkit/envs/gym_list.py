@@ -193,12 +193,16 @@ class Gymnasium:
         for i, (env, row) in enumerate(zip(self.envs, state["rows"], strict=True)):
             self._episode[i] = max(row["episode"], 0) - 1
             self._begin(i)
+            self._totals.step_count[i] = 0
             for action in row["actions"]:
-                obs, reward, *_ = env.step(action.copy())
+                try:
+                    obs, reward, *_ = env.step(action.copy())
+                except FAILURES as error:
+                    self._fail(i, error)
                 self._write(i, obs, "step")
                 self._totals.episode_reward[i] += np.float32(reward)
+                self._totals.step_count[i] += 1
                 self._begun[i] = False
-            self._totals.step_count[i] = len(row["actions"])
         longest = max(history, key=len)
         taken = np.zeros((len(longest), self.num_envs, *longest.shape[1:]), longest.dtype)
         self._since = np.array([len(longest) - len(actions) for actions in history])
