@@ -76,7 +76,7 @@ def test_a_vector_that_fails_names_what_it_knows():
     env.simulator.env.step = lambda actions: 1 / 0
     collector = collectors.VectorCollector(env, modules.categorical_actor(env), frames_per_batch=3, compile="off")
     with pytest.raises(
-        EnvironmentFailed, match=r"^environments 0 to 2 \(SyncVectorEnv, seed 1\), step 1 since the start"
+        EnvironmentFailed, match=r"^environments 0 to 2 \(CartPoleVectorEnv, seed 1\), step 1 since the start"
     ):
         collector.rollout()
 
