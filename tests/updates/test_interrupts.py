@@ -20,7 +20,7 @@ def test_an_interrupt_inside_a_loss_stays_one(off_policy: bool, first: bool):
         update: Any = updates.OffPolicyUpdate(
             loss, data.ReplayBuffer(env, 100), torch.optim.Adam(loss.parameters()), **settings
         )
-        network = loss.qvalue_network
+        network: Any = loss.qvalue_network
     else:
         actor, critic = modules.gaussian_actor(env, (4,)), modules.state_value(env, (4,))
         loss = losses.ClipPPOLoss(actor, critic)
