@@ -14,7 +14,7 @@ from torch.utils.weak import WeakTensorKeyDictionary
 from pgkit.checks import entries, explain, owners, rollouts
 from pgkit.checks.broadcasts import BroadcastError, NoBroadcasts
 from pgkit.checks.keys import is_loss
-from pgkit.checks.view import LossView, untouched
+from pgkit.checks.view import LossView, result_of, untouched
 from pgkit.errors import UserError
 
 _SEEN = WeakTensorKeyDictionary()  # parameters of the actors that an update has looked at, and may have trained since
@@ -80,15 +80,15 @@ def _trial(view: LossView, batch: TensorDictBase) -> TensorDictBase:
 def _without_broadcasts(view: LossView, batch: TensorDictBase) -> TensorDictBase:
     try:
         with NoBroadcasts(view.name):
-            return view.loss(batch.copy())
+            return result_of(view.loss, batch.copy())
     except BroadcastError as error:
         entries.check_action(view, batch)
         try:
             with NoBroadcasts(view.name):  # with fewer rows, as a network may have as many features
-                view.loss(batch[:-1])
+                result_of(view.loss, batch[:-1])
         except BroadcastError:
             raise error from None
-        return view.loss(batch.copy())
+        return result_of(view.loss, batch.copy())
 
 
 def _check_result(view: LossView, batch: TensorDictBase, out: Any) -> None:

@@ -9,7 +9,7 @@ from functools import partial
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDictBase, is_tensorclass
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictParams
 from torch import Tensor, nn
 from torchrl.objectives import LossModule
@@ -215,6 +215,12 @@ class LossView:
                 target_params=None if target is None else target.detach(),
             )
         return rollout
+
+
+def result_of(loss: nn.Module, batch: TensorDictBase) -> Any:
+    """What the loss returns for a batch; TorchRL's ``GRPOLoss`` has a class of its own for a TensorDict."""
+    out = loss(batch)
+    return out.to_tensordict() if is_tensorclass(out) else out
 
 
 def name_of(block: Any) -> str:

@@ -166,7 +166,7 @@ class Compiled:
 
     def _compile(self, graph: Any, inputs: Sequence[Tensor]) -> Callable[..., Any]:
         if self.rung == REPLAYED:
-            return graph.forward
+            return lambda inputs: graph.forward(*inputs)
         if self.most is not None and len(graph.graph.nodes) > self.most:
             raise RuntimeError(f"it is {len(graph.graph.nodes)} operations, too many to compile soon")
         return compile_record(graph, inputs)

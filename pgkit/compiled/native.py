@@ -17,6 +17,7 @@ from torch.compiler import is_dynamo_compiling
 from torch.fx import GraphModule, Node
 from torch.fx.experimental.proxy_tensor import make_fx
 from torch.fx.subgraph_rewriter import replace_pattern
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from pgkit.compiled.products import as_they_are, fastest_products
 
@@ -28,8 +29,9 @@ _OPTIONS: dict[str, Any] = {
     "alignment_asserts": False,
 }
 # sums over a few action dimensions as loops, which are vectorized: written out, every row takes scalar code;
-# C++ around the kernels: Python there costs a small step a quarter of its time
-_CPU_OPTIONS: dict[str, Any] = {"unroll_reductions_threshold": 1, "cpp_wrapper": True}
+# C++ around the kernels: Python there costs a small step a quarter of its time; one allocation for what lies between
+# kernels: a small step makes 50 tensors, most of one number
+_CPU_OPTIONS: dict[str, Any] = {"unroll_reductions_threshold": 1, "cpp_wrapper": True, "memory_planning": True}
 
 
 def record(function: Callable[..., Any], inputs: Sequence[Tensor]) -> GraphModule:
@@ -42,6 +44,22 @@ def record(function: Callable[..., Any], inputs: Sequence[Tensor]) -> GraphModul
         graph = make_fx(function)(*inputs)
     _mask_in_place(graph)
     return graph
+
+
+class Instead(TorchDispatchMode):
+    """Within it, ``instead(operation, *args, **kwargs)`` runs in the place of every tensor operation."""
+
+    def __init__(self, instead: Callable[..., Any]) -> None:
+        super().__init__()
+        self._instead = instead
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        return self._instead(func, *args, **(kwargs or {}))
+
+
+def copy_all(to: Sequence[Tensor], given: Sequence[Tensor]) -> None:
+    """Copies each of the given tensors to its place, in one call."""
+    torch._foreach_copy_(to, given)  # pyright: ignore[reportArgumentType]
 
 
 def _mask_in_place(graph: GraphModule) -> None:
@@ -100,8 +118,11 @@ def _torchrl_told_so() -> Iterator[None]:
             vars(module)["is_dynamo_compiling"] = is_dynamo_compiling
 
 
-def compile_record(graph: GraphModule, inputs: Sequence[Tensor]) -> Callable[..., Any]:
-    """Inductor's code for a recorded graph. It checks nothing: call it with tensors like ``inputs`` and no others."""
+def compile_record(graph: GraphModule, inputs: Sequence[Tensor]) -> Callable[[list[Tensor]], list[Tensor]]:
+    """Inductor's code for a recorded graph: a function of a list, which it empties.
+
+    It checks nothing: call it with tensors like ``inputs`` and no others.
+    """
     from torch._inductor.compile_fx import compile_fx, compile_fx_inner  # 4 seconds, for those who compile
 
     (results,) = graph.graph.output_node().args
@@ -111,6 +132,7 @@ def compile_record(graph: GraphModule, inputs: Sequence[Tensor]) -> Callable[...
     if all(x.device.type == "cpu" for x in tensors):
         options = _OPTIONS | _CPU_OPTIONS
         _batch_products(graph)
+        _quick_tanh(graph)
         for node in graph.graph.nodes:
             node.meta.clear()  # the C++ wrapper refuses values of the recording's own mode
     kernels: list[Any] = []
@@ -126,9 +148,9 @@ def compile_record(graph: GraphModule, inputs: Sequence[Tensor]) -> Callable[...
         taken, compiled = kernels[0]
         if taken == len(tensors) and len(compiled.output_strides or ()) == len(cast(Any, results)):
             run = compiled.current_callable
-            return lambda *inputs: run([*inputs, *constants])
+            return (lambda inputs: run(inputs + constants)) if constants else run
     code = getattr(code, "__wrapped__", code)  # a wrapper that only keeps dynamo out
-    return lambda *inputs: code(*inputs, *constants)
+    return lambda inputs: code(*inputs, *constants)
 
 
 def _as_inputs(graph: GraphModule) -> list[Tensor]:
@@ -159,6 +181,17 @@ def _batch_products(graph: GraphModule) -> None:
 
     replace_pattern(graph, lambda x, y: aten.mm.default(x, y), product)
     replace_pattern(graph, lambda bias, x, y: aten.addmm.default(bias, x, y), biased)
+
+
+def _quick_tanh(graph: GraphModule) -> None:
+    """The hyperbolic tangent by a quicker function, within 3 units in the last place: it took a fifth of a PPO step."""
+    aten = torch.ops.aten
+
+    def by_expm1(x: Tensor) -> Tensor:
+        power = aten.expm1.default(aten.mul.Tensor(aten.clamp.default(x, -20.0, 20.0), 2.0))
+        return aten.div.Tensor(power, aten.add.Tensor(power, 2.0))
+
+    replace_pattern(graph, lambda x: aten.tanh.default(x), by_expm1)
 
 
 def torch_compiled(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -33,7 +33,7 @@ class Recorder:
         function: ``(data, *inputs) -> tensors``; changes tensors of ``held`` in place, and entries of ``data``.
         held: parameters, buffers, optimizer state and the like, each once.
         keys: the entries of the data, but for those that are held (a replay's priorities are both).
-        compile: ``(graph, inputs) -> code``.
+        compile: ``(graph, inputs) -> code``, a function of a list of tensors.
     """
 
     function: Function
@@ -43,7 +43,7 @@ class Recorder:
 
     def leaves(self, data: TensorDictBase | None) -> list[Tensor]:
         """The tensors of data."""
-        return [] if data is None else [data[key] for key in self.keys]
+        return [] if data is None else [data[key].detach() for key in self.keys]
 
     def graph(
         self, data: TensorDictBase | None, inputs: Sequence[Tensor]
@@ -74,8 +74,7 @@ class Recorder:
         code = self.compile(graph, [*fixed, *leaves, *inputs])
 
         def run(*tensors: Tensor) -> list[Tensor] | None:
-            with torch.no_grad():
-                results = code(*fixed, *tensors)
+            results = code([*fixed, *tensors])
             return results if not decisions else results[1:] if results[0] else None
 
         return run, decisions

@@ -12,7 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from pgkit.checks import LossView, assembly, check_settings, diagram
+from pgkit.checks import LossView, assembly, check_settings, diagram, result_of
 from pgkit.compiled import Compiled, Mode, check_compile, choose, compiled
 from pgkit.errors import UserError
 from pgkit.functional import standardize
@@ -188,13 +188,13 @@ class OnPolicyUpdate:
         """One step on a minibatch, of so many steps for so many frames."""
         params, key = parameters(self.optimizer), self._view.key("advantage") or "advantage"
 
-        def gradients(data: TensorDictBase, index: Tensor) -> tuple[Tensor, Grads]:
+        def gradients(data: TensorDictBase, index: Tensor) -> tuple[list[Tensor], Grads]:
             batch = cast(TensorDictBase, data[index])
             if self.augment is not None:
                 batch = self.augment(batch)
             if self.normalize_advantage:
                 batch = batch.copy().set(key, standardize(batch[key]))
-            out = self.loss(batch)
+            out = result_of(self.loss, batch)
             grads = grads_of(out, params)
             return metrics_of(out, names, like=grads[0]), grads
 

@@ -46,9 +46,10 @@ class TrustRegionUpdate:
 
     :math:`F` is the Hessian of the mean :math:`KL(\pi_{old} \| \pi)` at :math:`\pi_{old}`, the Fisher matrix, of which
     only products with vectors are formed (a double backward pass); :math:`x` is from conjugate gradients. :math:`j` is
-    the least for which the loss falls and the KL is at most :math:`\delta`; if none up to ``backtracks`` is, the policy
-    stays. Schulman et al., 2015 (https://arxiv.org/abs/1502.05477, appendix C). Without the line search (:math:`j = 0`)
-    it is the natural policy gradient with a normalized step (Rajeswaran et al., 2017, https://arxiv.org/abs/1703.02660).
+    the least for which the loss falls and the KL is at most :math:`\delta`; if none up to ``backtracks`` is, or the
+    gradient is not finite, the policy stays. Schulman et al., 2015 (https://arxiv.org/abs/1502.05477, appendix C).
+    Without the line search (:math:`j = 0`) it is the natural policy gradient with a normalized step (Rajeswaran et al.,
+    2017, https://arxiv.org/abs/1703.02660).
 
     Args:
         loss: a loss with :meth:`~pgkit.losses.PolicyLoss.kl`, e.g. :class:`pgkit.losses.TRPOLoss`; the policy steps on
@@ -138,7 +139,8 @@ class TrustRegionUpdate:
             self._assign(start + size * full)
             with torch.no_grad():
                 improvement, kl = float(before - self._policy_loss(self.loss(batch))), float(self.loss.kl(batch).mean())
-            if not self.line_search or (improvement > 0 and kl <= self.max_kl):
+            better = improvement > 0 and kl <= self.max_kl
+            if better if self.line_search else full.isfinite().all():
                 result = {"kl": kl, "improvement": improvement, "step_size": size}
                 break
         else:
@@ -181,7 +183,7 @@ class TrustRegionUpdate:
             return Plan(own, None, flat[:size])
         rest = [name for name in names if name not in own]
 
-        def gradients(data: TensorDictBase, index: Tensor) -> tuple[Tensor, Grads]:
+        def gradients(data: TensorDictBase, index: Tensor) -> tuple[list[Tensor], Grads]:
             out = self.loss(data[index])
             grads = grads_of(out, critic, only=(CRITIC,))
             return metrics_of(out, rest, like=grads[0]), grads

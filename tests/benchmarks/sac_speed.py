@@ -133,7 +133,7 @@ def replay(threads: int, prioritized: bool) -> dict[str, float]:
     step = update._plan.every
     index = buffer.sample_index(BATCH)[0]
     batch = update._batches.gather(buffer.data, index)
-    loss, optimizer, names = update.loss, update.optimizer, step.names[:-1]
+    loss, optimizer, names = update.loss, update.optimizer, step.names[:-2]
     params = [p for group in optimizer.param_groups for p in group["params"]]
 
     def gradients(data: Any, _: Any) -> Any:
