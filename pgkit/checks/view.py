@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Callable
 from dataclasses import fields
 from functools import partial
 from typing import Any
@@ -254,26 +253,9 @@ def run(net: Any, params: Any, call: Callable[[], Any]) -> Any:
     """``call()`` with ``params`` in ``net``, without gradients and without a trace."""
     held = list(params.values(True, True))
     copies = params.apply(lambda x: x if isinstance(x, nn.Parameter) else x.clone())  # statistics may move in these
-    with torch.no_grad(), same_random_numbers(held), copies.to_module(net, preserve_module_state=False):
+    cards = list({tensor.device for tensor in held if tensor.is_cuda})
+    with torch.no_grad(), torch.random.fork_rng(devices=cards), copies.to_module(net, preserve_module_state=False):
         return call()
-
-
-def same_random_numbers(tensors: Sequence[Tensor]) -> AbstractContextManager[None]:
-    """What is drawn within, on the CPU and on the devices of these tensors, does not move the random generators."""
-    return torch.random.fork_rng(devices=list({tensor.device for tensor in tensors if tensor.is_cuda}))
-
-
-@contextmanager
-def untouched(tensors: Sequence[Tensor]) -> Iterator[None]:
-    """What happens within to those of the tensors that are no parameters, and to random generators, is undone."""
-    before = [(tensor, tensor.detach().clone()) for tensor in tensors if not isinstance(tensor, nn.Parameter)]
-    try:
-        with same_random_numbers(tensors):
-            yield
-    finally:
-        with torch.no_grad():
-            for tensor, value in before:
-                tensor.copy_(value)
 
 
 def keys_of(block: Any, name: str) -> list[Any]:

@@ -29,9 +29,8 @@ _OPTIONS: dict[str, Any] = {
     "alignment_asserts": False,
 }
 # sums over a few action dimensions as loops, which are vectorized: written out, every row takes scalar code;
-# C++ around the kernels: Python there costs a small step a quarter of its time; one allocation for what lies between
-# kernels: a small step makes 50 tensors, most of one number
-_CPU_OPTIONS: dict[str, Any] = {"unroll_reductions_threshold": 1, "cpp_wrapper": True, "memory_planning": True}
+# C++ around the kernels: Python there costs a small step a quarter of its time
+_CPU_OPTIONS: dict[str, Any] = {"unroll_reductions_threshold": 1, "cpp_wrapper": True}
 
 
 def record(function: Callable[..., Any], inputs: Sequence[Tensor]) -> GraphModule:

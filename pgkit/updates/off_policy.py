@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
@@ -179,7 +180,8 @@ class OffPolicyUpdate:
 
     def _assemble(self, data: TensorDictBase, index: Tensor) -> Plan:
         batch = self._batches.gather(data, index)
-        names = assembly(self._view, self.optimizer, batch, owners_of_gamma=self._batches.settings())
+        look = partial(assembly, self._view, self.optimizer, batch, owners_of_gamma=self._batches.settings())
+        names = undone(self.loss.buffers(), look)
         every = self._gradient_step(names, None, average=True)
         if self.actor_delay == 1:
             return Plan(every, every, batch)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, cast
 
 import torch
@@ -13,13 +14,12 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from pgkit.checks import LossView, assembly, check_settings, diagram, result_of
-from pgkit.compiled import Compiled, Mode, check_compile, choose, compiled
+from pgkit.compiled import Compiled, Mode, check_compile, choose, compiled, undone
 from pgkit.errors import UserError
 from pgkit.functional import standardize
 from pgkit.optim import parameters
 from pgkit.seams import Augmentation
-from pgkit.updates.minibatches import means, minibatches
-from pgkit.updates.sequences import as_rows
+from pgkit.updates.minibatches import as_rows, means, minibatches
 from pgkit.updates.state import load, save
 from pgkit.updates.step import GradientStep, Grads, grads_of, metrics_of
 
@@ -179,7 +179,8 @@ class OnPolicyUpdate:
         keys = view.readable(estimated)
         flat = as_rows(estimated.select(*keys), self.sequence_length)
         batch = flat[: self._size(flat)]
-        names = assembly(view, self.optimizer, batch, rollout=rollout, resumed=self.frames > 0)
+        look = partial(assembly, view, self.optimizer, batch, rollout=rollout, resumed=self.frames > 0)
+        names = undone(self.loss.buffers(), look)
         anchors = [key for key in (*view.keys("value"), *view.keys("sample_log_prob")) if key in keys]
         step = self._gradient_step(names, flat.numel(), self.epochs * -(-len(flat) // len(batch)))
         return Plan(block, keys, anchors, step, batch), flat

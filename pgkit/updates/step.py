@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
-from functools import partial
+from functools import partial, reduce
 from typing import Any, cast
 
 import torch
@@ -34,7 +34,7 @@ def metrics_of(out: TensorDictBase, names: Iterable[str], like: Tensor) -> list[
 
 def norm_of(grads: Grads) -> Tensor:
     """The norm of the gradient over all parameters."""
-    return torch.stack([grad.square().sum() for grad in grads]).sum().sqrt()
+    return reduce(torch.add, [grad.square().sum() for grad in grads]).sqrt()  # no stack: that is a tensor for each
 
 
 class GradientStep:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
@@ -12,11 +13,10 @@ from torch import Tensor, nn
 from torch.optim import SGD, Optimizer
 
 from pgkit.checks import LossView, assembly, check_settings, diagram
-from pgkit.compiled import check_compile, choose
+from pgkit.compiled import check_compile, choose, undone
 from pgkit.functional import conjugate_gradient
 from pgkit.optim import parameters
-from pgkit.updates.minibatches import means, minibatches
-from pgkit.updates.sequences import as_rows
+from pgkit.updates.minibatches import as_rows, means, minibatches
 from pgkit.updates.state import load, save
 from pgkit.updates.step import GradientStep, Grads, grads_of, metrics_of
 
@@ -177,7 +177,8 @@ class TrustRegionUpdate:
         rows, critic = len(flat), [] if self.optimizer is None else parameters(self.optimizer)
         size = min(self.minibatch_size or rows, rows)
         every = SGD([*self._params, *critic], lr=0.0)  # who is trained, by the step or by the optimizer
-        names = assembly(self._view, every, flat[:size], rollout=rollout, resumed=self.frames > 0)
+        look = partial(assembly, self._view, every, flat[:size], rollout=rollout, resumed=self.frames > 0)
+        names = undone(self.loss.buffers(), look)
         own = [name for name in names if name not in (CRITIC, "explained_variance")]
         if self.optimizer is None:
             return Plan(own, None, flat[:size])

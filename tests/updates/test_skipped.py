@@ -93,7 +93,7 @@ def agent(sampler=None):
 def test_targets_and_priorities_stay():
     update, rollout = agent(data.Prioritized())
     assert update(rollout)["skipped"] == 0
-    rewards = update.buffer.data["next", "reward"]
+    rewards = update.buffer.data["frames", "reward"]
     kept = rewards.clone()
     rewards.fill_(torch.inf)
     before = everything(update.loss, update.optimizer, update.buffer.sampler)
