@@ -56,8 +56,11 @@ class GradientStep:
         watch: modules that ``gradients`` uses, by name, as in :func:`pgkit.compiled.compiled`.
         holds: further tensors that change in place.
         max_grad_norm: bound of the gradient's norm over all parameters; None: no bound.
-        average: moves the target networks, last, where the 0-dim bool that it is given is True.
-        between: ``grads -> grads`` before the norm clip: the average over several learners.
+        after: what follows the optimizer's step: weights are projected, target networks move. It is given a 0-dim bool;
+            where that is False, nothing may change.
+        between: ``grads -> grads`` before the norm clip.
+        mean: ``[*metrics, *grads] -> [*metrics, *grads]`` before that: the mean over several learners.
+        agree: as in :func:`pgkit.compiled.compiled`.
         apart: keeps the two graphs apart, for a call on several minibatches.
         mode: as in :func:`pgkit.compiled.compiled`.
 
@@ -75,22 +78,25 @@ class GradientStep:
         watch: Mapping[str, Any],
         holds: Iterable[Tensor] = (),
         max_grad_norm: float | None = None,
-        average: Callable[[Tensor], None] | None = None,
+        after: Callable[[Tensor], None] | None = None,
         between: Callable[[Grads], Grads] | None = None,
+        mean: Callable[[Sequence[Tensor]], list[Tensor]] | None = None,
+        agree: Callable[[bool], bool] = bool,
         apart: bool = False,
         mode: Mode = "off",
     ) -> None:
         if max_grad_norm is not None and max_grad_norm <= 0:
             raise UserError(f"max_grad_norm={max_grad_norm} lets nothing be trained: give a bound above 0, or None")
-        self.optimizer, self.names, self.between = optimizer, [*names, "grad_norm", "skipped"], between
+        self.optimizer, self.names = optimizer, [*names, "grad_norm", "skipped"]
+        self.between, self.mean = between, mean
         self._params = optim.parameters(optimizer) if params is None else list(params)
         self._gradients, self._watch, self._holds = gradients, watch, list(holds)
-        self._max_grad_norm, self._average = max_grad_norm, average
+        self._max_grad_norm, self._after = max_grad_norm, after
         self._rules = rules = None if mode == "off" else optim.bound(optimizer, self._params)
-        self._apart = apart or between is not None or rules is None
+        self._apart = apart or between is not None or mean is not None or rules is None
         self._statistics: list[Tensor] | None = None  # buffers that the loss writes to as it runs
         held = [*self._params, *([] if rules is None else rules.tensors), *self._holds]
-        native = partial(compiled, watch=watch, holds=held)
+        native = partial(compiled, watch=watch, holds=held, agree=agree)
         self.native = (
             native(self._first, others=other_rows, mode=mode, name="the update"),
             native(self._second, others=_other_gradients, mode=mode if rules else "off", name="the optimizer's step"),
@@ -121,8 +127,8 @@ class GradientStep:
             optim.step(self.optimizer, self._params, grads)
         for x, old in zip(self._statistics or (), before, strict=True):
             x.copy_(torch.where(finite, x, old))
-        if self._average is not None:
-            self._average(finite)
+        if self._after is not None:
+            self._after(finite)
         return norm, (~finite).to(norm.dtype)
 
     def _copies(self) -> list[Tensor]:
@@ -162,8 +168,9 @@ class GradientStep:
     def _in_two(self, run: Callable[[Tensor], Sequence[Tensor]]) -> Callable[..., Tensor]:
         def call(*indices: Tensor) -> Tensor:
             rows, before = sum(map(len, indices)), self._copies()
-            total = _sum(map(run, indices), [len(index) / rows for index in indices])
-            metrics, grads = total[: -len(self._params)], total[-len(self._params) :]
+            results = _sum(map(run, indices), [len(index) / rows for index in indices])
+            results = results if self.mean is None else self.mean(results)
+            metrics, grads = results[: -len(self._params)], results[-len(self._params) :]
             grads = grads if self.between is None else self.between(grads)
             return torch.stack([*metrics, *self.native[1].bind(None, *grads, *before)(*grads, *before)])
 
