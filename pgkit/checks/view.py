@@ -242,8 +242,7 @@ def shape_of(data: TensorDictBase) -> str:
 
 def bounds(dist: Any) -> tuple[Any, Any]:
     """Least and greatest action of a distribution, as far as it knows them; else None."""
-    low, high = getattr(dist, "low", None), getattr(dist, "high", None)
-    logits = getattr(dist, "logits", None)
+    low, high, logits = (getattr(dist, name, None) for name in ("low", "high", "logits"))
     if low is None and logits is not None and not dist.sample().is_floating_point():
         return 0, logits.shape[-1] - 1
     return low, high

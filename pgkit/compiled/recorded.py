@@ -17,7 +17,7 @@ from torch.overrides import TorchFunctionMode
 
 from pgkit.compiled.captured import captured
 from pgkit.compiled.decisions import Decisions
-from pgkit.compiled.native import record
+from pgkit.compiled.native import constants_of, record
 from pgkit.compiled.trial import check_repeats, undone
 
 Function = Callable[..., Sequence[Tensor]]
@@ -148,9 +148,8 @@ def _by_decisions(
 def _check_constants(graph: GraphModule, held: Sequence[Tensor]) -> None:
     """A RuntimeError for a tensor that a graph uses without being given it, and that is a held one or written to."""
     memory = {tensor.untyped_storage().data_ptr() for tensor in held}
-    for node in graph.graph.find_nodes(op="get_attr"):
-        constant = getattr(graph, str(node.target))
-        if isinstance(constant, Tensor) and constant.untyped_storage().data_ptr() in memory:
+    for node, constant in constants_of(graph):
+        if constant.untyped_storage().data_ptr() in memory:
             raise RuntimeError(f"'{node.target}' shares memory with a parameter or buffer without being it")
         if _is_written(node):
             raise RuntimeError(f"it writes to '{node.target}', which is none of what it holds")

@@ -98,7 +98,8 @@ def bound(update: Any, device: str, rows: int) -> tuple[Callable[[], Any], Any]:
     if isinstance(update, updates.OffPolicyUpdate):
         update.buffer.extend(rollout(device))
         update.train(1)
-        step, index = update._plan.every, update.buffer.sample_index(256)[0]
+        plan: Any = update._plan
+        step, index = plan.every, update.buffer.sample_index(256)[0]
         return partial(step.bind(update.buffer.data, index), index), step.native[0]
     whole = rollout(device, max(rows * 2, NUM_ENVS * STEPS))
     update.epochs = 1
