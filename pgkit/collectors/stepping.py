@@ -15,7 +15,7 @@ from torch import Tensor
 from pgkit.collectors.actor import is_state, memory, path_of
 from pgkit.collectors.policy import RowPolicy, choices, function_of, padded_rows, random_actions
 from pgkit.collectors.rebuild import Past
-from pgkit.compiled import Mode
+from pgkit.compiled import Mode, copy_all
 from pgkit.envs import VectorEnv
 from pgkit.errors import UserError
 from pgkit.seams import Entries, Key, Simulator
@@ -114,11 +114,11 @@ class Share:
             for now, decided, after, drawn, t in zip(
                 self._now, self._decided, self._next, noise, range(self._steps), strict=True
             ):
-                torch._foreach_copy_(now, [*[fresh[key] for key in observed], *remembered.values()])
+                copy_all(now, [*[fresh[key] for key in observed], *remembered.values()])
                 outputs = policy(now, drawn)
-                torch._foreach_copy_(decided, outputs)
+                copy_all(decided, outputs)
                 made = simulator.step({key: outputs[at] for key, at in actions})
-                torch._foreach_copy_(after, [
+                copy_all(after, [
                     *[made.next[key] for key in observed], *made.reward.values(), *made.terminated.values(),
                     *made.truncated.values(), *made.info.values(), *simulator.episode_reward.values(),
                     simulator.step_count,

@@ -11,6 +11,7 @@ from functools import partial
 from logging import INFO, WARNING, getLogger
 from typing import Any, Literal, cast
 
+import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
@@ -181,7 +182,7 @@ class Compiled:
         if self.fixed:
             check_shapes(graph)
         if self.rung == REPLAYED:
-            return graph.forward
+            return torch.no_grad()(lambda inputs: graph.forward(*inputs))
         if self.most is not None and len(graph.graph.nodes) > self.most:
             raise RuntimeError(f"it is {len(graph.graph.nodes)} operations, too many to compile soon")
         return compile_record(graph, inputs)

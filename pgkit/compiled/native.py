@@ -17,6 +17,7 @@ from torch.compiler import is_dynamo_compiling
 from torch.fx import GraphModule, Node
 from torch.fx.experimental.proxy_tensor import make_fx
 from torch.fx.subgraph_rewriter import replace_pattern
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from pgkit.compiled.convolutions import halve_convolutions
 from pgkit.compiled.products import as_they_are, fastest_products
@@ -43,6 +44,22 @@ def record(function: Callable[..., Any], inputs: Sequence[Tensor]) -> GraphModul
         graph = make_fx(function)(*inputs)
     _mask_in_place(graph)
     return graph
+
+
+class Instead(TorchDispatchMode):
+    """Within it, ``instead(operation, *args, **kwargs)`` runs in the place of every tensor operation."""
+
+    def __init__(self, instead: Callable[..., Any]) -> None:
+        super().__init__()
+        self._instead = instead
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        return self._instead(func, *args, **(kwargs or {}))
+
+
+def copy_all(to: Sequence[Tensor], given: Sequence[Tensor]) -> None:
+    """Copies each of the given tensors to its place, in one call."""
+    torch._foreach_copy_(to, given)  # pyright: ignore[reportArgumentType]
 
 
 def _mask_in_place(graph: GraphModule) -> None:
@@ -84,7 +101,7 @@ def check_shapes(graph: GraphModule) -> None:
             raise RuntimeError("values decide how many elements it picks (x[mask]): use torch.where")
     for node in graph.graph.nodes:
         counts = node.target is not torch.ops.aten.index.Tensor and node.op == "call_function"
-        if counts and torch.Tag.dynamic_output_shape in getattr(node.target, "tags", ()):
+        if counts and torch.Tag.dynamic_output_shape in _tags(node):
             raise RuntimeError(f"values decide how many elements {node.target} gives: use torch.where")
 
 
@@ -97,7 +114,12 @@ def _is_mask(index: Sequence[Node | None], x: Node) -> bool:
 def _is_elementwise(node: Node) -> bool:
     """Whether this is an elementwise operation on one tensor and numbers, and its result is used once."""
     one = len(_with_dimensions(node)) == len(node.users) == 1
-    return one and torch.Tag.pointwise in getattr(node.target, "tags", ())
+    return one and torch.Tag.pointwise in _tags(node)
+
+
+def _tags(node: Node) -> Sequence[torch.Tag]:
+    """What torch says of an operation; nothing of what is no operation of torch's."""
+    return getattr(node.target, "tags", ())
 
 
 def _with_dimensions(node: Node) -> list[Node]:
@@ -122,8 +144,11 @@ def _torchrl_told_so() -> Iterator[None]:
             vars(module)["is_dynamo_compiling"] = is_dynamo_compiling
 
 
-def compile_record(graph: GraphModule, inputs: Sequence[Tensor]) -> Callable[..., Any]:
-    """Inductor's code for a recorded graph. It checks nothing: call it with tensors like ``inputs`` and no others."""
+def compile_record(graph: GraphModule, inputs: Sequence[Tensor]) -> Callable[[list[Tensor]], Any]:
+    """Inductor's code for a recorded graph: a function of a list, which it empties.
+
+    It checks nothing: call it with tensors like ``inputs`` and no others.
+    """
     from torch._inductor.compile_fx import compile_fx, compile_fx_inner  # 4 seconds, for those who compile
 
     (results,) = graph.graph.output_node().args
@@ -134,6 +159,7 @@ def compile_record(graph: GraphModule, inputs: Sequence[Tensor]) -> Callable[...
     if all(x.device.type == "cpu" for x in tensors):
         options = _OPTIONS | _CPU_OPTIONS
         _batch_products(graph)
+        _quick_tanh(graph)
         for node in graph.graph.nodes:
             node.meta.clear()  # the C++ wrapper refuses values of the recording's own mode
     kernels: list[Any] = []
@@ -149,25 +175,29 @@ def compile_record(graph: GraphModule, inputs: Sequence[Tensor]) -> Callable[...
         taken, compiled = kernels[0]
         if taken == len(tensors) and len(compiled.output_strides or ()) == len(cast(Any, results)):
             run = compiled.current_callable
-            return lambda *inputs: run([*inputs, *constants])
+            return (lambda inputs: run(inputs + constants)) if constants else run
     code = getattr(code, "__wrapped__", code)  # a wrapper that only keeps dynamo out
-    return lambda *inputs: code(*inputs, *constants)
+    return lambda inputs: code(*inputs, *constants)
 
 
 def _as_inputs(graph: GraphModule) -> list[Tensor]:
     """Makes the tensors that a graph refers to its last inputs, and returns them."""
     constants = []
     after = graph.graph.find_nodes(op="placeholder")[-1]
-    for node in graph.graph.find_nodes(op="get_attr"):
-        constant = getattr(graph, str(node.target))
-        if isinstance(constant, Tensor):
-            with graph.graph.inserting_after(after):
-                after = graph.graph.placeholder(f"constant_{len(constants)}")
-            node.replace_all_uses_with(after)
-            graph.graph.erase_node(node)
-            constants.append(constant.detach())
+    for node, constant in constants_of(graph):
+        with graph.graph.inserting_after(after):
+            after = graph.graph.placeholder(f"constant_{len(constants)}")
+        node.replace_all_uses_with(after)
+        graph.graph.erase_node(node)
+        constants.append(constant.detach())
     graph.recompile()
     return constants
+
+
+def constants_of(graph: GraphModule) -> list[tuple[Node, Tensor]]:
+    """The tensors that a graph refers to without being given them."""
+    found = [(node, getattr(graph, str(node.target))) for node in graph.graph.find_nodes(op="get_attr")]
+    return [(node, x) for node, x in found if isinstance(x, Tensor)]
 
 
 def _batch_products(graph: GraphModule) -> None:
@@ -182,6 +212,17 @@ def _batch_products(graph: GraphModule) -> None:
 
     replace_pattern(graph, lambda x, y: aten.mm.default(x, y), product)
     replace_pattern(graph, lambda bias, x, y: aten.addmm.default(bias, x, y), biased)
+
+
+def _quick_tanh(graph: GraphModule) -> None:
+    """The hyperbolic tangent by a quicker function, within a few roundings: it took a fifth of a PPO step."""
+    aten = torch.ops.aten
+
+    def by_expm1(x: Tensor) -> Tensor:
+        power = aten.expm1.default(aten.mul.Tensor(aten.clamp.default(x, -20.0, 20.0), 2.0))
+        return aten.div.Tensor(power, aten.add.Tensor(power, 2.0))
+
+    replace_pattern(graph, lambda x: aten.tanh.default(x), by_expm1)
 
 
 def torch_compiled(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -60,8 +60,12 @@ class Prioritized:
         return self.tree.find(share.to(self.tree.sums.device)).view(batches, batch_size)
 
     def write_back(self, index: Tensor, td_error: Tensor) -> None:
-        """Makes the errors ``[B]`` the priorities of the rows ``index [B]``; compiles into the update."""
+        """Makes the errors ``[B]`` the priorities of the rows ``index [B]``; compiles into the update.
+
+        A row whose error is not finite keeps its priority.
+        """
         priority = (td_error.abs().double() + self.eps) ** self.alpha
+        priority = torch.where(priority.isfinite(), priority, self.tree.values[index])
         self.largest.copy_(torch.maximum(self.largest, priority.max()))
         self.tree.set(index, priority)
 

@@ -52,6 +52,11 @@ class Loss(LossModule):
             return getattr(self, item.removeprefix("target_")).detach()  # LossModule's .data is hidden from a recording
         return super().__getattr__(item)
 
+    def register_buffer(self, name: str, tensor: Tensor | None, persistent: bool = True) -> None:
+        """As in torch, on the device of the networks: a CUDA graph takes nothing from another."""
+        device = next((p.device for p in self.parameters()), None)
+        super().register_buffer(name, tensor if tensor is None else tensor.to(device=device), persistent)
+
     def _reads(self) -> list[NestedKey]:
         """Every entry that ``forward`` reads; a key may come twice."""
         raise NotImplementedError(f"{type(self).__name__} has no _reads(): return the keys that its forward reads")

@@ -100,7 +100,6 @@ class QLoss(Loss):
     ) -> None:
         super().__init__(reduction)
         within(0, 1, gamma=gamma)
-        self.register_coeff_buffer("gamma", gamma, dtype=torch.float64)
         self.delay_actor, self.delay_qvalue, self.augmented = delay_actor, delay_qvalue, augmented
         self.convert_to_functional(actor_network, "actor_network", create_target_params=delay_actor)
         networks, self.num_critics, self._together = _arranged(qvalue_network, num_qvalue_nets)
@@ -112,6 +111,7 @@ class QLoss(Loss):
             create_target_params=delay_qvalue,
             compare_against=list(actor_network.parameters()) if separate_losses else None,
         )
+        self.register_coeff_buffer("gamma", gamma, dtype=torch.float64)
         self._make_vmap()
         if isinstance(actor_network, PROBABILISTIC):
             self.set_keys(action=actor_network.dist_sample_keys[0], log_prob=actor_network.log_prob_keys[0])
