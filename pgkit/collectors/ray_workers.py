@@ -161,8 +161,12 @@ class RayWorkers:
             return True
         for ref in self._ray.wait(list(pending), num_returns=len(pending), timeout=timeout)[0]:
             self._take(pending[ref], ref)
-        missing = [i for i, ref in enumerate(self._refs) if ref is not None]
-        self._waiting.go_on([self._there[i] for i in missing], timeout=0)
+        missing = [self._there[i] for i, ref in enumerate(self._refs) if ref is not None]
+        try:
+            self._waiting.go_on(missing, timeout=0)
+        except UserError:
+            self.close()
+            raise
         return not missing
 
     def _take(self, i: int, ref: Any) -> None:

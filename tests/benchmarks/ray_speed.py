@@ -44,7 +44,7 @@ def collector(kind: Any, workers: int, env_id: Any = "HalfCheetah-v5", num_envs:
     torch.manual_seed(0)
     env = envs.make(env_id, num_envs=num_envs, seed=1, workers=workers)
     frames = num_envs * sizes.get("steps", STEPS)
-    return kind(env, modules.gaussian_actor(env, hidden=(64, 64)), frames_per_batch=frames, compile="on")
+    return kind(env, modules.gaussian_actor(env, hidden=(64, 64)), frames_per_batch=frames, compile="off")
 
 
 def speed(rollout: Callable[[], Any], frames: int) -> float:
