@@ -103,11 +103,11 @@ class RayWorkers:
         """Whether :meth:`finish` would not wait."""
         return self._receive(timeout=0)
 
-    @staticmethod
-    def wait_any(groups: Sequence[RayWorkers]) -> None:
+    def wait_any(self, groups: Sequence[RayWorkers]) -> bool:
         """Waits until something of these has come, for a moment at most."""
         pending = [ref for workers in groups for ref in workers._refs if ref is not None]
-        groups[0]._ray.wait(pending, num_returns=1, timeout=_TICK)
+        self._ray.wait(pending, num_returns=1, timeout=_TICK)
+        return True
 
     def finish(self) -> Entries:
         """The rollout's buffers ``[T, N, ...]`` of this object's environments, the caller's to keep."""

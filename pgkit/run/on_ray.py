@@ -48,6 +48,7 @@ def collector(
     actor: TensorDictModuleBase,
     *,
     frames_per_batch: int,
+    overlap: bool = False,
     asynchronous: bool = False,
     **lag: Any,
 ) -> VectorCollector | AsyncCollector | RayCollector:
@@ -55,13 +56,16 @@ def collector(
 
     Args:
         frames_per_batch: frames of a rollout that is handed out.
-        asynchronous: each process delivers by itself, beside the update.
+        overlap: the next rollout is collected beside the update.
+        asynchronous: as ``overlap``, and each process delivers by itself.
         lag: with ``asynchronous``, ``max_lag`` and ``delay`` of :class:`~pgkit.collectors.AsyncCollector`.
     """
     sizes: Any = {"frames_per_batch": frames_per_batch, "total_frames": args.total_frames, "compile": args.compile}
+    if args.ray and overlap:
+        raise UserError("--overlap: not with --ray, whose actors wait for the update; leave one of the two out")
     if args.ray:
         where = {"address": args.ray_address, "wait": args.ray_wait}
         return RayCollector(env, actor, **sizes, **where, asynchronous=asynchronous, **lag)
-    if asynchronous:
-        return AsyncCollector(env, actor, **sizes, per_worker=True, **lag)
+    if overlap or asynchronous:
+        return AsyncCollector(env, actor, **sizes, per_worker=asynchronous, **lag)
     return VectorCollector(env, actor, **sizes)
