@@ -24,7 +24,7 @@ from pgkit.collectors.stepping import Share, allocate, regroup
 from pgkit.collectors.workers import WorkerEnded, shares
 from pgkit.compiled import Mode, load_matmul_state, matmul_state
 from pgkit.envs import VectorEnv
-from pgkit.errors import UserError
+from pgkit.errors import EnvironmentFailed, UserError
 from pgkit.seams import Entries, MakeSimulator
 
 _TICK = 0.5  # seconds between looks at what is slow to come
@@ -177,7 +177,7 @@ class RayWorkers:
             self._refs[i], self._asked[i], self._deaths[i] = None, None, 0
         except errors.RayTaskError as error:
             self.close()
-            if isinstance(error.cause, UserError):
+            if isinstance(error.cause, UserError | EnvironmentFailed):
                 raise error.cause from None
             raise RuntimeError(f"collecting process {i} failed:\n{error.traceback_str}") from None
         except gone as error:
