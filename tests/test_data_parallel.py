@@ -59,7 +59,7 @@ def make_rollout(seed, masked=False):
 def outcome(update, normalizer, metrics):
     """What the learners have learned."""
     state = [x.clone() for values in update.optimizer.state.values() for x in values.values()]
-    return {"parameters": list(update.loss.parameters()), "optimizer": state, "metrics": metrics} | {
+    return {"parameters": [p.detach().clone() for p in update.loss.parameters()], "optimizer": state, "metrics": metrics} | {
         "normalizer": list(normalizer.state_dict().values())
     }
 
