@@ -58,7 +58,12 @@ def save(path: Path, content: Any) -> None:
     plain = _encode(content, path.name)
     with replacing(path) as file:
         hashed = _Hashing(file)
-        torch.save(plain, hashed)
+        try:
+            torch.save(plain, hashed)
+        except RuntimeError:  # torch's writer has one of its own for a write that failed
+            if hashed.failed is None:
+                raise
+            raise hashed.failed from None
         file.write(_MARK + hashed.sha256.digest())
 
 
@@ -88,10 +93,15 @@ class _Hashing:
 
     def __init__(self, file: IO[bytes]) -> None:
         self.file, self.sha256 = file, hashlib.sha256()
+        self.failed: OSError | None = None
 
     def write(self, data: Any) -> int:
         self.sha256.update(data)
-        return self.file.write(data)
+        try:
+            return self.file.write(data)
+        except OSError as error:
+            self.failed = error
+            raise
 
     def flush(self) -> None:
         self.file.flush()

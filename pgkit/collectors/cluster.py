@@ -12,6 +12,7 @@ from typing import Any
 from pgkit.errors import UserError
 
 _SAID_EVERY = 10.0  # seconds
+_ONE_NODE = {"health_check_failure_threshold": 1_000_000}  # a machine that slept an hour is not a dead node
 
 
 def ray_module() -> ModuleType:
@@ -51,7 +52,8 @@ def connect(address: str | None = None, cpus: int = 1) -> None:
         return
     os.environ.setdefault("RAY_worker_niceness", "0")  # Ray's own 15 lets everything else on the machine go first
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    ray.init(address="local", num_cpus=max(cpus, os.cpu_count() or 1), include_dashboard=False, **quiet)
+    places = max(cpus, os.cpu_count() or 1)
+    ray.init(address="local", num_cpus=places, include_dashboard=False, _system_config=_ONE_NODE, **quiet)
 
 
 class Waiting:

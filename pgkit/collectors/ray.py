@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from functools import partial
 from typing import Any
 
 from tensordict import TensorDictBase
@@ -64,7 +63,7 @@ class RayCollector:
         env = vector_of(env)
         sizes = {"frames_per_batch": frames_per_batch, "total_frames": total_frames}
         settings: Any = {**sizes, "init_random_frames": init_random_frames, "compile": compile, "pool": self._pool}
-        self._wait, self._pools = wait, list[RayWorkers]()
+        self._wait, self.pools = wait, list[RayWorkers]()
         if asynchronous:
             self._inner = AsyncCollector(env, actor, **settings, per_worker=True, max_lag=max_lag, delay=delay)
         else:
@@ -96,12 +95,12 @@ class RayCollector:
     @property
     def deaths(self) -> int:
         """Actors that died and were made again."""
-        return sum(pool.deaths for pool in self._pools)
+        return sum(pool.deaths for pool in self.pools)
 
     @property
     def lost(self) -> int:
         """Episodes that those deaths cut short: none where the environments can be brought to where they were."""
-        return sum(pool.lost for pool in self._pools)
+        return sum(pool.lost for pool in self.pools)
 
     def state_dict(self) -> dict[str, Any]:
         """As of the collector that it is like; a number of actors is as good as another."""
@@ -116,5 +115,5 @@ class RayCollector:
         self._inner.shutdown()
 
     def _pool(self, *settings: Any) -> RayWorkers:
-        self._pools.append(RayWorkers(*settings, wait=self._wait))
-        return self._pools[-1]
+        self.pools.append(RayWorkers(*settings, wait=self._wait))
+        return self.pools[-1]

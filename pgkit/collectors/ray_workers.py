@@ -1,8 +1,10 @@
-"""Ray actors that each hold some environments and the policy: the workers of a collector, on any machine of a cluster."""
+"""Ray actors that each hold some environments and the policy: a collector's workers, on any machine of a cluster."""
 
 from __future__ import annotations
 
 import copy
+import os
+import pickle
 import sys
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
@@ -63,13 +65,13 @@ class RayWorkers:
         self._keys = list(buffers)
         self._orders, self._layouts = [], []
         for first, end in pairwise(self._bounds):
-            columns = {key: x[:, first:end] for key, x in buffers.items()}
+            layout = Layout(x[:, first:end] for x in buffers.values())
             order = _Order(
-                env.make, first, end - first, env.num_envs, env.seed, actor, self._weights, outputs, columns, compile,
-                matmul_state(),
+                env.make, first, end - first, env.num_envs, env.seed, actor, self._weights, outputs, self._keys,
+                layout, compile, matmul_state(),
             )  # fmt: skip
             self._orders.append(ray.put(cloudpickle.dumps(order)))
-            self._layouts.append(Layout(columns.values()))
+            self._layouts.append(layout)
         self._remote: Any = ray.remote(RemoteShare).options(num_cpus=1, max_restarts=0)
         self._known = [Known(env, end - first, outputs) for first, end in pairwise(self._bounds)]
         self._waiting = Waiting("collecting processes", wait)
@@ -78,8 +80,17 @@ class RayWorkers:
         self.deaths = self.lost = 0
         for i in range(self._count):
             self._make(i)
-            self._ask(i, "there")
+            self._ask(i, "place")
         self._all()
+
+    def places(self) -> list[tuple[str, int]]:
+        """Where each actor is: a machine's address, and the number of a process there."""
+        return self._ray.get(self._there)
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the actors are there: any failure but a death ends them all."""
+        return bool(self._actors)
 
     def begin(self, weights: Iterable[Tensor], step: int, random: bool = False) -> None:
         """Starts a rollout with these weights, the values of the actor's ``state_dict()``; as :meth:`Share.collect`."""
@@ -92,37 +103,30 @@ class RayWorkers:
         """Whether :meth:`finish` would not wait."""
         return self._receive(timeout=0)
 
-    @staticmethod
-    def wait_any(groups: Sequence[RayWorkers]) -> None:
+    def wait_any(self, groups: Sequence[RayWorkers]) -> bool:
         """Waits until something of these has come, for a moment at most."""
         pending = [ref for workers in groups for ref in workers._refs if ref is not None]
-        groups[0]._ray.wait(pending, num_returns=1, timeout=_TICK)
+        self._ray.wait(pending, num_returns=1, timeout=_TICK)
+        return True
 
     def finish(self) -> Entries:
         """The rollout's buffers ``[T, N, ...]`` of this object's environments, the caller's to keep."""
-        blocks = self._all()
-        parts = [layout.unpack(block) for layout, (block, _) in zip(self._layouts, blocks, strict=True)]
-        whole = [torch.cat(columns, 1) for columns in zip(*parts, strict=True)]
-        for known, part, (_, state) in zip(self._known, parts, blocks, strict=True):
-            known.collected(dict(zip(self._keys, part, strict=True)), state)
-        return dict(zip(self._keys, whole, strict=True))
+        columns = zip(*self._all(), strict=True)
+        return {key: torch.cat(parts, 1) for key, parts in zip(self._keys, columns, strict=True)}
 
     def state_dict(self) -> list[dict[str, Any]]:
         """The state of every actor's share."""
         self._all()
         for i in range(self._count):
             self._ask(i, "state")
-        states = self._all()
-        for known, state in zip(self._known, states, strict=True):
-            known.told(state)
-        return states
+        return [pickle.loads(state) for state in self._all()]
 
     def load_state_dict(self, states: list[dict[str, Any]]) -> None:
         """Gives every actor its share of :meth:`state_dict`, taken with any number of processes."""
         self._all()
         for i, state in enumerate(regroup(states, self._bounds)):
-            self._ask(i, "load", state)
-            self._known[i].told(state)
+            self._known[i].told(pickle.dumps(state))
+            self._ask(i, "load", self._known[i].past.state)
         self._all()
 
     def close(self) -> None:
@@ -134,7 +138,7 @@ class RayWorkers:
     def _make(self, i: int) -> None:
         """Makes an actor, where the one before was, and gives it that one's request again."""
         actor = self._actors[i] = self._remote.remote()
-        self._there[i] = actor.there.remote()
+        self._there[i] = actor.place.remote()
         self._built[i] = actor.build.remote(sys.path, self._orders[i], self._known[i].past)
         if self._asked[i] is not None:
             self._ask(i, *self._asked[i])
@@ -165,7 +169,7 @@ class RayWorkers:
         errors = self._ray.exceptions
         gone = (errors.RayActorError, errors.ObjectLostError, errors.NodeDiedError, errors.WorkerCrashedError)
         try:
-            self._answers[i] = self._ray.get(ref)
+            self._answers[i] = self._noted(i, self._ray.get(ref))
             self._refs[i], self._asked[i], self._deaths[i] = None, None, 0
         except errors.RayTaskError as error:
             self.close()
@@ -174,6 +178,18 @@ class RayWorkers:
             raise RuntimeError(f"collecting process {i} failed:\n{error.traceback_str}") from None
         except gone as error:
             self._replace(i, str(error))
+
+    def _noted(self, i: int, answer: Any) -> Any:
+        """The answer, and for a rollout its tensors; what it says of the environments is remembered."""
+        request, known = self._asked[i][0], self._known[i]
+        if request == "state":
+            known.told(answer)
+        if request != "collect":
+            return answer
+        block, state = answer
+        parts = self._layouts[i].unpack(block)
+        known.collected(dict(zip(self._keys, parts, strict=True)), state)
+        return parts
 
     def _replace(self, i: int, reason: str) -> None:
         """Makes an actor in the place of one that died."""
@@ -197,7 +213,7 @@ def _nones(length: int, lists: int) -> list[list[Any]]:
 
 
 class _Order(NamedTuple):
-    """What an actor is given; its buffers are as those of ``like``."""
+    """What an actor is given."""
 
     make: MakeSimulator
     first: int
@@ -207,7 +223,8 @@ class _Order(NamedTuple):
     actor: TensorDictModuleBase
     weights: Layout
     outputs: Entries
-    like: Entries
+    keys: list[Any]
+    layout: Layout
     compile: Mode
     matmul: dict[str, Any]
 
@@ -215,8 +232,9 @@ class _Order(NamedTuple):
 class RemoteShare:
     """A share of the environments in an actor; the first argument of each request is a step that must have worked."""
 
-    def there(self, _: None = None) -> None:
-        """Says that the actor has found a place."""
+    def place(self, _: None = None) -> tuple[str, int]:
+        """Where the actor has found a place: a machine's address, and the number of a process there."""
+        return ray_module().util.get_node_ip_address(), os.getpid()
 
     def build(self, path: Sequence[str], order: bytes, past: Past) -> None:
         """Makes the environments and records the policy; brings them to where another share was."""
@@ -225,16 +243,17 @@ class RemoteShare:
         given: _Order = cloudpickle.loads(order)
         load_matmul_state(given.matmul)
         self._actor, self._weights = given.actor, given.weights
-        layout = Layout(given.like.values())
-        self._block = torch.zeros(layout.size, dtype=torch.uint8)
-        buffers = dict(zip(given.like, layout.views(self._block), strict=True))
+        self._block = torch.zeros(given.layout.size, dtype=torch.uint8)
+        buffers = dict(zip(given.keys, given.layout.views(self._block), strict=True))
         self._share = Share(
             given.make(given.first, given.count, given.seed), given.first, given.num_envs, given.seed, self._actor,
             given.outputs, buffers, given.compile,
         )  # fmt: skip
         self._share.rebuild(past)
 
-    def collect(self, _: None, weights: np.ndarray, step: int, random: bool, tells: bool) -> tuple[np.ndarray, Any]:
+    def collect(
+        self, _: None, weights: np.ndarray, step: int, random: bool, tells: bool
+    ) -> tuple[np.ndarray, bytes | None]:
         """A rollout as one block, and the state after it if asked for."""
         with torch.no_grad():
             for mine, theirs in zip(self._actor.state_dict().values(), self._weights.unpack(weights), strict=True):
@@ -242,10 +261,10 @@ class RemoteShare:
         self._share.collect(step, random)
         return self._block.numpy(), self.state(None) if tells else None
 
-    def state(self, _: None) -> dict[str, Any]:
-        """As :meth:`Share.state_dict`."""
-        return self._share.state_dict()
+    def state(self, _: None) -> bytes:
+        """As :meth:`Share.state_dict`, pickled: of what Ray pickles, arrays are read-only."""
+        return pickle.dumps(self._share.state_dict())
 
-    def load(self, _: None, state: dict[str, Any]) -> None:
+    def load(self, _: None, state: bytes) -> None:
         """As :meth:`Share.load_state_dict`."""
-        self._share.load_state_dict(state)
+        self._share.load_state_dict(pickle.loads(state))

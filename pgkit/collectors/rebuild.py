@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from torch import Tensor
 
@@ -18,12 +18,12 @@ class Past(NamedTuple):
     """Brings a new :class:`~pgkit.collectors.stepping.Share` to where another one was.
 
     Attributes:
-        state: of ``Share.state_dict()``; None: it had just been made.
+        state: of ``Share.state_dict()``, pickled; None: it had just been made.
         actions: taken since, ``[T, n, ...]`` a rollout.
         memory: the states ``[n, ...]`` that the policy wrote in the last of those steps, by its output keys.
     """
 
-    state: dict[str, Any] | None
+    state: bytes | None
     actions: list[Entries]
     memory: dict[Key, Tensor]
 
@@ -47,7 +47,7 @@ class Known:
         """Whether the share is to tell its state with its next rollout."""
         return not self._exact or self._steps >= _MOST_STEPS
 
-    def collected(self, buffers: Entries, state: dict[str, Any] | None) -> None:
+    def collected(self, buffers: Entries, state: bytes | None) -> None:
         """Notes a rollout's ``[T, n, ...]``, and the state after it where the share told it."""
         self._rollouts += 1
         if state is not None:
@@ -58,7 +58,7 @@ class Known:
         self.past = Past(self.past.state, [*self.past.actions, actions], memory)
         self._steps += len(next(iter(actions.values())))
 
-    def told(self, state: dict[str, Any]) -> None:
+    def told(self, state: bytes) -> None:
         """Notes the state as of now."""
         self._steps, self.past = 0, Past(state, [], {})
 

@@ -12,7 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from pgkit.collectors.actor import Beside, example
-from pgkit.collectors.stepping import MASK, Share, allocate, as_rollout, regroup
+from pgkit.collectors.stepping import MASK, Share, allocate, as_rollout, lost, regroup
 from pgkit.collectors.workers import MakePool, Pool, Workers, check_splits
 from pgkit.compiled import Constants, choose
 from pgkit.envs import VectorEnv, vector_of
@@ -100,8 +100,7 @@ class VectorCollector:
             self._pool().begin(self.actor.state_dict().values(), step, random)
             buffers = self._pool().finish()
         else:
-            share = self._alone()
-            share.collect(step, random)
+            self._alone().collect(step, random)
             buffers = {key: x.clone() for key, x in self._buffers.items()}
         rollout = as_rollout(buffers, self.env)
         self.frames += count(rollout)
@@ -109,14 +108,20 @@ class VectorCollector:
         return self._beside.bring(rollout)
 
     def state_dict(self) -> dict[str, Any]:
-        """Counters, and the state of every environment and of the policy's memory."""
-        shares = self._pool().state_dict() if self._pooled else [self._alone().state_dict()]
+        """Counters, and the state of every environment and of the policy's memory.
+
+        After a rollout that failed, the environments have none: they begin new episodes.
+        """
+        if self._workers is not None and not self._workers.is_open:
+            shares = [lost(self._rollouts * self._steps)]
+        else:
+            shares = self._pool().state_dict() if self._pooled else [self._alone().state_dict()]
         return {"frames": self.frames, "rollouts": self._rollouts, "shares": shares}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restores :meth:`state_dict`, also one taken with another number of workers."""
         self.frames, self._rollouts = state["frames"], state["rollouts"]
-        say_resume(self.env)
+        say_resume(self.env, state["shares"][0])
         if self._pooled:
             self._pool().load_state_dict(state["shares"])
         else:
@@ -132,8 +137,10 @@ class VectorCollector:
 
     def _pool(self) -> Pool:
         """The workers; they get new weights only, and start again where something else in the actor was replaced."""
-        changed = self._constants.changed(memory=False) if self._workers and self._constants else None
         state = None
+        if self._workers is not None and not self._workers.is_open:  # one has failed
+            state, self._workers = [lost(self._rollouts * self._steps)], None
+        changed = self._constants.changed(memory=False) if self._workers and self._constants else None
         if self._workers is not None and changed:
             getLogger("pgkit").warning(
                 "the workers start again: in the actor %s (a buffer changed in place, by fill_, needs no such thing)",
@@ -176,7 +183,11 @@ def count(rollout: TensorDictBase) -> int:
     return rollout.numel() if mask is None else int(mask.sum())
 
 
-def say_resume(env: VectorEnv) -> None:
+def say_resume(env: VectorEnv, share: dict[str, Any]) -> None:
     """The one line that says what a resume brings back."""
-    exact = "every environment goes on where it was" if env.resume == "exact" else "every environment begins anew"
-    getLogger("pgkit").info("the resumed run: %s (%s)", exact, env.env_id)
+    is_lost = share["simulator"].keys() == {"steps"}
+    exact = "every environment goes on where it was"
+    if is_lost or env.resume != "exact":
+        exact = "every environment begins anew"
+    why = ": the run before it ended in the middle of a rollout" if is_lost and env.resume == "exact" else ""
+    getLogger("pgkit").info("the resumed run: %s%s (%s)", exact, why, env.env_id)

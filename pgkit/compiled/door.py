@@ -15,7 +15,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from pgkit.compiled.constants import Constants, tensors_of
-from pgkit.compiled.native import compile_record, torch_compiled
+from pgkit.compiled.native import check_shapes, compile_record, torch_compiled
 from pgkit.compiled.recorded import Bind, Function, Recorder, recorded
 from pgkit.compiled.trial import check_repeats
 from pgkit.errors import UserError
@@ -78,6 +78,7 @@ class Compiled:
         holds: further tensors that it changes or that change in place: optimizer state, priorities, a cache.
         agree: whether all of several learners took a rung, from whether this one did.
         most: operations that are worth compiling, of a function that may be a long loop; it skips ``torch.compile``.
+        fixed: refuses a record in which values decide how many elements something has.
 
     Attributes:
         seconds: spent recording and compiling so far.
@@ -92,6 +93,7 @@ class Compiled:
     holds: Sequence[Tensor] = ()
     agree: Callable[[bool], bool] = bool
     most: int | None = None
+    fixed: bool = False
     seconds: float = field(default=0.0, init=False)
     rung: str = field(default=EAGER, init=False)
     _built: dict[Any, Bind] = field(default_factory=dict, init=False)
@@ -176,6 +178,8 @@ class Compiled:
         return bind
 
     def _compile(self, graph: Any, inputs: Sequence[Tensor]) -> Callable[..., Any]:
+        if self.fixed:
+            check_shapes(graph)
         if self.rung == REPLAYED:
             return graph.forward
         if self.most is not None and len(graph.graph.nodes) > self.most:

@@ -127,6 +127,53 @@ class OrnsteinUhlenbeck(TensorDictModuleBase):
         return out
 
 
+class NoiseRepeat(TensorDictModuleBase):
+    r"""A squashed Gaussian actor whose noise stays the same for a random number of steps.
+
+    .. math:: a = \tanh(\mu(s) + \sigma(s) \epsilon), \qquad P(n) \propto n^{-\zeta}, \quad n = 1, \dots, n_{max}
+
+    with :math:`\epsilon \sim N(0, 1)` drawn anew every :math:`n` steps, and :math:`n` with it: long pushes in one
+    direction explore further than trembling (FlashSAC, 2026, https://arxiv.org/abs/2604.04539). An episode begins with
+    new noise. Without exploration, as in evaluation, the action is the actor's own.
+
+    The noise and the steps left are carried from step to step, as by :class:`OrnsteinUhlenbeck`.
+
+    Args:
+        actor: :func:`~pgkit.modules.tanh_normal_actor`, which writes ``loc`` and ``scale``.
+        env: the bounds come from its specs.
+        zeta: :math:`\zeta`.
+        longest: :math:`n_{max}`; 1 draws anew at every step.
+    """
+
+    shares: Tensor
+
+    def __init__(self, actor: TensorDictModuleBase, env: EnvBase, zeta: float = 2.0, longest: int = 16) -> None:
+        super().__init__()
+        self.actor, self.bounds = actor, ActionBounds(env)
+        self.state_shape = (self.bounds.shape[-1] + 1,)  # the noise, and the steps that it has left
+        self.state_key: NestedKey = (*self.bounds.group, "recurrent_state")
+        self._next_key: NestedKey = ("next", *self.state_key)
+        self.in_keys = [*actor.in_keys, "is_init", self.state_key]
+        self.out_keys = [self.bounds.key, self._next_key]
+        weights = torch.arange(1, longest + 1, dtype=torch.float64) ** -zeta
+        self.register_buffer("shares", (weights.cumsum(0) / weights.sum()).float().to(self.bounds.low.device))
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """The actor's ``action``, of kept noise, and the state of the noise."""
+        out = self.actor(tensordict)
+        if explores():
+            noise, left = tensordict[self.state_key].split([self.state_shape[0] - 1, 1], -1)
+            drawn = 1 + (torch.rand_like(left) > self.shares).sum(-1, keepdim=True)
+            anew = tensordict["is_init"] | (left < 0.5)
+            noise = torch.where(anew, torch.randn_like(noise), noise)
+            left = torch.where(anew, drawn, left)
+            squashed = (out["loc"] + out["scale"] * noise).tanh()
+            middle = (self.bounds.low + self.bounds.high) / 2
+            out[self.bounds.key] = self.bounds(middle, squashed)
+            out[self._next_key] = torch.cat([noise, left - 1], -1)
+        return out
+
+
 class ActionBounds(nn.Module):
     """``(action, noise) -> action + half_range * noise`` within the bounds of an environment's action."""
 

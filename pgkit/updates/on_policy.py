@@ -18,6 +18,7 @@ from pgkit.errors import UserError
 from pgkit.functional import standardize
 from pgkit.optim import parameters
 from pgkit.seams import Augmentation
+from pgkit.updates.interrupts import interruptible
 from pgkit.updates.learners import Alone, Learners
 from pgkit.updates.minibatches import means, minibatches
 from pgkit.updates.sequences import as_rows
@@ -110,6 +111,7 @@ class OnPolicyUpdate:
         self._plan: Plan | None = None
         check_settings(self._view, vars(self))
 
+    @interruptible
     def __call__(self, rollout: TensorDictBase) -> dict[str, float]:
         """Trains on a rollout ``[num_envs, T]``; metrics are means over the minibatches.
 

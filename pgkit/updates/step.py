@@ -48,7 +48,7 @@ class GradientStep:
         watch: modules that ``gradients`` uses, by name, as in :func:`pgkit.compiled.compiled`.
         holds: further tensors that change in place.
         max_grad_norm: bound of the gradient's norm over all parameters; None: no bound.
-        average: moves the target networks, last.
+        after: what follows the optimizer's step: the target networks move.
         between: ``grads -> grads`` before the norm clip.
         mean: ``[metrics, *grads] -> [metrics, *grads]`` before that: the mean over several learners.
         agree: as in :func:`pgkit.compiled.compiled`.
@@ -69,7 +69,7 @@ class GradientStep:
         watch: Mapping[str, Any],
         holds: Iterable[Tensor] = (),
         max_grad_norm: float | None = None,
-        average: Callable[[], None] | None = None,
+        after: Callable[[], None] | None = None,
         between: Callable[[Grads], Grads] | None = None,
         mean: Callable[[Sequence[Tensor]], list[Tensor]] | None = None,
         agree: Callable[[bool], bool] = bool,
@@ -92,8 +92,8 @@ class GradientStep:
                 factor = optim.computed_once((max_grad_norm / (norm + 1e-6)).clamp(max=1.0))
                 grads = [grad * factor for grad in grads]
             step(grads)
-            if average is not None:
-                average()
+            if after is not None:
+                after()
             return norm
 
         def first(data: TensorDictBase, index: Tensor) -> list[Tensor]:
