@@ -193,7 +193,7 @@ def main(args: Args) -> None:
                 built.scale.update(rollout["value_target"])
             log.step(collector.frames, rollout, metrics)
         collector.shutdown()
-        if args.learners > 1:
+        if isinstance(update, updates.RayLearners):
             update.shutdown()
 
 

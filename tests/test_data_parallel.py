@@ -59,8 +59,11 @@ def make_rollout(seed, masked=False):
 def outcome(update, normalizer, metrics):
     """What the learners have learned."""
     state = [x.clone() for values in update.optimizer.state.values() for x in values.values()]
-    return {"parameters": list(update.loss.parameters()), "optimizer": state, "metrics": metrics} | {
-        "normalizer": list(normalizer.state_dict().values())
+    return {
+        "parameters": [p.detach().clone() for p in update.loss.parameters()],
+        "optimizer": state,
+        "normalizer": list(normalizer.state_dict().values()),
+        "metrics": metrics,
     }
 
 

@@ -36,8 +36,9 @@ def make_rollout():
         return torch.randn(8, ROWS // 8, *size)
 
     flags = {key: torch.zeros(8, ROWS // 8, 1, dtype=torch.bool) for key in ("done", "terminated")}
-    following = {"observation": draw(17), "reward": draw(1), **flags}
-    data = {"observation": draw(17), "action": draw(6), "action_log_prob": draw() - 8, "next": following}
+    observation = draw(17)
+    following = {"observation": torch.cat([observation[:, 1:], draw(17)[:, :1]], 1), "reward": draw(1), **flags}
+    data = {"observation": observation, "action": draw(6), "action_log_prob": draw() - 8, "next": following}
     return TensorDict(data, (8, ROWS // 8))
 
 
