@@ -106,3 +106,10 @@ class Loss(LossModule):
     def average(self, entry: Tensor, batch: TensorDictBase) -> Tensor:
         """The metric ``[]`` of an entry ``[*B]`` or ``[*B, 1]``: its mean without gradient, padded entries left out."""
         return self._reduce_loss(entry.detach(), batch, reduction="mean")
+
+
+def masks_of(keys: tuple[NestedKey, ...], action: Any, mask_key: Any) -> tuple[NestedKey, ...]:
+    """TorchRL's masks, and that of the group whose actions these are: its agents that are gone do not count."""
+    first = listed(action)[0]
+    grouped = not isinstance(first, str) and mask_key == "auto"
+    return (*keys, (*first[:-1], "mask")) if grouped else keys

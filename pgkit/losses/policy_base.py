@@ -25,7 +25,7 @@ from pgkit.functional import (
 )
 from pgkit.functional.values import Distance
 from pgkit.losses.actors import need_distribution
-from pgkit.losses.base import Loss
+from pgkit.losses.base import Loss, masks_of
 
 
 class PolicySettings(TypedDict, total=False):
@@ -229,10 +229,7 @@ class PolicyLoss(Loss):
         return torch.stack([self._expand_loss_mask(x, entry) for x in found]).all(0) if found else None
 
     def _loss_mask_keys(self) -> tuple[NestedKey, ...]:
-        """TorchRL's, and the mask of the group whose actions these are: its agents that are gone do not count."""
-        action, keys = listed(self.tensor_keys.action)[0], super()._loss_mask_keys()
-        grouped = not isinstance(action, str) and self.loss_mask_key == "auto"
-        return (*keys, (*action[:-1], "mask")) if grouped else keys
+        return masks_of(super()._loss_mask_keys(), self.tensor_keys.action, self.loss_mask_key)
 
     def result(self, batch: TensorDictBase, objective: Tensor, dist: Distribution) -> TensorDict:
         """Losses and metrics of an unreduced ``objective [*B, 1]``, to be maximized; of entropy and value too."""

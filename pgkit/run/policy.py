@@ -22,7 +22,7 @@ class Policy:
     """A policy with its observation normalizer, and the env it was trained for.
 
     ``to_env`` makes of the policy's actions what the environment takes, as in training; None leaves them. Of several
-    groups of agents it does so for the first, and ``others`` have the further groups' by the keys of their actions.
+    groups of agents ``by_group`` does so, by the keys of their actions.
     ``observation_shape`` is a mapping from names to shapes where the policy reads the entries of a Dict;
     ``observation_dtype`` names their types where they are not float32.
     """
@@ -34,10 +34,10 @@ class Policy:
     frames: int = 0
     observation_dtype: dict[Any, str] = field(default_factory=dict)
     args: RunArgs | None = None
-    others: dict[Any, Callable[[np.ndarray], np.ndarray]] = field(default_factory=dict)
+    by_group: dict[Any, Callable[[np.ndarray], np.ndarray]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self._acting = Acting(self.actor, (self.action_key, *self.others))
+        self._acting = Acting(self.actor, tuple(self.by_group) or (self.action_key,))
         self._begins = True
 
     @classmethod
@@ -98,12 +98,10 @@ class Policy:
         begun = torch.full((len(next(iter(entries.values()))),), self._begins)
         actions = {key: x.cpu().numpy() for key, x in self._acting(entries, begun, deterministic).items()}
         self._begins = False
-        first, converters = self.action_key, dict(self.others)
-        if self.to_env is not None:
-            converters[first] = self.to_env
-        actions = {key: converters[key](x) if key in converters else x for key, x in actions.items()}
+        convert: Any = self.by_group or {self.action_key: self.to_env or (lambda x: x)}
+        actions = {key: convert[key](x) for key, x in actions.items()}
         actions = {key: x[0] if single else x for key, x in actions.items()}
-        return {key[0]: x for key, x in actions.items()} if self.others else actions[first]
+        return {key[0]: x for key, x in actions.items()} if self.by_group else actions[self.action_key]
 
     def _by_key(self, obs: Any) -> dict[Key, Any]:
         """The arrays given, by the keys that the policy reads them from."""
@@ -129,7 +127,7 @@ def dotted(key: Key) -> str:
 
 
 def _converter(spec: Any) -> ToEnv:
-    """What makes the environment's of a further group's actions."""
+    """What makes the environment's of a group's actions."""
     if not isinstance(spec, Bounded):
         return ToEnv()
     return ToEnv(spec.low.cpu().numpy(), spec.high.cpu().numpy(), np.dtype(np.float32))
@@ -137,12 +135,12 @@ def _converter(spec: Any) -> ToEnv:
 
 def describe_env(env: Any) -> dict[str, Any]:
     """What :class:`Policy` must know of an env: the observation's shape and type, and how actions become its own."""
-    spec = env.observation_spec_unbatched
+    spec, acted = env.observation_spec_unbatched, env.action_keys
     shapes = {name: tuple(spec[name].shape) for name in spec.keys(True, True)}
     dtypes = {name: str(spec[name].dtype).removeprefix("torch.") for name in shapes}
     return {
         "observation_shape": shapes["observation"] if list(shapes) == ["observation"] else shapes,
         "to_env": env.to_env,
-        "others": {key: _converter(env.full_action_spec_unbatched[key]) for key in env.action_keys[1:]},
+        "by_group": {key: _converter(env.full_action_spec_unbatched[key]) for key in acted if len(acted) > 1},
         "observation_dtype": {name: dtype for name, dtype in dtypes.items() if dtype != "float32"},
     }

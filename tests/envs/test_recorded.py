@@ -61,7 +61,8 @@ def compare(eager: Any, recorded: Any, count: int = 20) -> None:
     draw = torch.Generator().manual_seed(0)
     for _ in range(count):
         spec = eager.action_spec["agents", "action"]
-        action = {("agents", "action"): 2 * torch.rand(spec.shape, generator=draw) - 1}
+        drawn = torch.rand(spec.shape, generator=draw)
+        action = {("agents", "action"): 2 * drawn - 1 if spec.dtype.is_floating_point else (spec.n * drawn).long()}
         a, b = eager.step(action), recorded.step(action)
         for one, other in ((a.next, b.next), (a.reward, b.reward), (a.terminated, b.terminated), (a.fresh, b.fresh)):
             for key, x in one.items():
@@ -162,7 +163,7 @@ def test_a_reset_that_cannot_be_recorded_runs_as_it_is_between_recorded_steps(ca
 def test_mistakes_are_one_line():
     with pytest.raises(UserError, match="compile is 'auto', 'on' or 'off', not 'yes'"):
         envs.make("vmas/balance", compile="yes")
-    with pytest.raises(UserError, match="compile='on' records torch simulators, a .* is none"):
+    with pytest.raises(UserError, match="compile='on' records batched torch simulators, a .* is none"):
         envs.make("CartPole-v1", compile="on")
     with pytest.raises(UserError, match="vmas/simple_push cannot be recorded .*outside of tensors"):
         envs.make("vmas/simple_push", compile="on")
