@@ -173,7 +173,7 @@ def test_a_worker_that_hangs_is_named_or_replaced(tmp_path: Path, caplog: Any):
 
 
 SLEEPER = """
-import os, sys, time
+import os, signal, time
 import gymnasium as gym
 import numpy as np
 from pgkit import collectors, envs, modules
@@ -190,6 +190,7 @@ class Sleeper(gym.Env):
             time.sleep(0.01)
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # which a shell's background jobs ignore
     env = envs.make(Sleeper, 2, workers=2)
     collectors.VectorCollector(env, modules.gaussian_actor(env), frames_per_batch=2, compile="off").rollout()
 """
