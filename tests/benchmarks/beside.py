@@ -94,7 +94,7 @@ def start(tree: Path, what: str) -> Any:
     paths = os.pathsep.join([str(tree), str(tree / "tests/benchmarks")])
     command = [sys.executable, "-P", __file__, "--worker", "--what", what]
     pipes: Any = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-    process = subprocess.Popen(command, env=os.environ | {"PYTHONPATH": paths}, cwd=tree, **pipes)
+    process: Any = subprocess.Popen(command, env=os.environ | {"PYTHONPATH": paths}, cwd=tree, **pipes)
     while (line := process.stdout.readline()) != "ready\n":
         if not line:
             raise SystemExit(f"{tree}: the benchmark ended")
