@@ -9,13 +9,16 @@ import sys
 import types
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import reduce
+from itertools import zip_longest
 from typing import Any, cast
 
 import torch
 from torch import Tensor
 from torch.compiler import is_dynamo_compiling
-from torch.fx import GraphModule, Node
+from torch.fx import GraphModule, Node, Proxy
 from torch.fx.experimental.proxy_tensor import make_fx
+from torch.fx.proxy import GraphAppendingTracer
 from torch.fx.subgraph_rewriter import replace_pattern
 from torch.utils._python_dispatch import TorchDispatchMode
 
@@ -218,14 +221,28 @@ def _batch_products(graph: GraphModule) -> None:
 
 
 def _quick_tanh(graph: GraphModule) -> None:
-    """The hyperbolic tangent by a quicker function, within a few roundings: it took a fifth of a PPO step."""
-    aten = torch.ops.aten
+    """The hyperbolic tangent of float32 by Lambert's continued fraction: the library's took a fifth of a PPO step.
 
-    def by_expm1(x: Tensor) -> Tensor:
-        power = aten.expm1.default(aten.mul.Tensor(aten.clamp.default(x, -20.0, 20.0), 2.0))
-        return aten.div.Tensor(power, aten.add.Tensor(power, 2.0))
+    Twelve terms of x / (1 + x^2 / (3 + x^2 / (5 + ...))), as a quotient of polynomials in x^2, are right within 8
+    roundings up to 8, where the tangent is 1 - 2e-7.
+    """
+    above, below = [1.0], [23.0]
+    for odd in range(21, 0, -2):
+        above, below = below, [odd * x + y for x, y in zip_longest(below, [0.0, *above], fillvalue=0.0)]
+    tracer = GraphAppendingTracer(graph.graph)
+    for node in graph.graph.find_nodes(op="call_function", target=torch.ops.aten.tanh.default):
+        if node.meta["val"].dtype is torch.float32:
+            with graph.graph.inserting_before(node):
+                x = torch.ops.aten.clamp.default(Proxy(node.all_input_nodes[0], tracer), -8.0, 8.0)
+                tanh = x * _polynomial(above, x * x) / _polynomial(below, x * x)
+            node.replace_all_uses_with(tanh.node)
+            graph.graph.erase_node(node)
+    graph.recompile()
 
-    replace_pattern(graph, lambda x: aten.tanh.default(x), by_expm1)
+
+def _polynomial(coefficients: Sequence[float], x: Any) -> Any:
+    *others, last = coefficients
+    return reduce(lambda result, coefficient: result * x + coefficient, reversed(others), last)
 
 
 def torch_compiled(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -49,9 +49,8 @@ class Prioritized:
     def extend(self, new: Tensor, gone: Tensor, td_error: Tensor | None = None) -> None:
         """Takes the rows ``gone`` out; the rows ``new`` get the priorities of their errors, or the largest one."""
         self.tree.set(gone, 0.0)
-        if td_error is None:
-            self.tree.set(new, self.largest)
-        elif len(new):
+        self.tree.set(new, self.largest)
+        if td_error is not None and len(new):
             self.write_back(new.to(td_error.device), td_error)
 
     def sample(self, batches: int, batch_size: int, generator: torch.Generator) -> Tensor:

@@ -45,6 +45,11 @@ def minibatches(
 
 
 def means(names: Sequence[str], results: Sequence[Tensor]) -> dict[str, float]:
-    """The metrics of several steps, averaged, off the device at once."""
-    mean = torch.stack(tuple(results)).mean(0) if len(results) > 1 else results[0]
-    return dict(zip(names, mean.tolist(), strict=True))
+    """The metrics of several steps, averaged, off the device at once.
+
+    Skipped steps, of which the last metric is 1, are left out, but for that metric; unless all were.
+    """
+    every = torch.stack(tuple(results))
+    taken = every[every[:, -1] == 0]
+    mean = (taken if len(taken) else every).mean(0).tolist()
+    return dict(zip(names, [*mean[:-1], every[:, -1].mean().item()], strict=True))

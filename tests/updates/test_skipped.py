@@ -6,6 +6,7 @@ from tensordict import TensorDict
 from torch import nn
 
 from pgkit import collectors, data, envs, losses, modules, updates
+from pgkit.updates.minibatches import means
 from pgkit.updates.step import GradientStep, grads_of, metrics_of
 from tests.losses.test_contract import batch, make
 
@@ -134,3 +135,10 @@ def test_an_adapting_coefficient_stays():
     assert step(rows, torch.arange(8))[-1] == 1 and all(map(torch.equal, everything(loss), before))
     rows["advantage"][:] = 1.0
     assert step(rows, torch.arange(8))[-1] == 0 and not torch.equal(loss.beta, torch.ones_like(loss.beta))
+
+
+def test_metrics_are_means_over_the_steps_that_were_taken():
+    # of 3 steps with losses 1, nan, 3 the second was skipped: (1 + 3) / 2 = 2, and a third was
+    results = [torch.tensor([1.0, 0.0]), torch.tensor([torch.nan, 1.0]), torch.tensor([3.0, 0.0])]
+    assert means(["loss", "skipped"], results) == {"loss": 2.0, "skipped": pytest.approx(1 / 3)}
+    assert means(["loss", "skipped"], [torch.tensor([torch.inf, 1.0])]) == {"loss": torch.inf, "skipped": 1.0}
