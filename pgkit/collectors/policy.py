@@ -91,8 +91,9 @@ class RowPolicy:
     """A policy for ``rows`` environments of a larger vector, whose results are those it has for all of them at once.
 
     Random numbers come from a stream for each environment (:class:`~pgkit.collectors.noise.Streams`), and fewer rows
-    than sixteen (of images: four) are padded, so that neither depends on which environments this process has. Where the policy's random numbers cannot be replaced, torch's
-    generator is seeded for each rollout and share, and the log says so.
+    than sixteen (of images: four) are padded, so that neither depends on which environments this process has. Where
+    the policy's random numbers cannot be replaced, torch's generator is seeded for each rollout and share, and the
+    log says so.
 
     Args:
         act: function of tensors ``[rows, ...]``.
