@@ -80,7 +80,7 @@ class Share:
         self._next = _rows(counted, [("next", *_path(key)) for key in self._after()])
         self._mask = buffers[MASK].unbind(0) if simulator.masks else None
         spec = simulator.action_spec
-        padded = padded_rows(simulator.num_envs, num_envs)
+        padded = padded_rows(self._now[0], num_envs)
         random = random_actions(spec if padded == spec.shape[0] else _padded(spec, padded), self._keys, outputs)
         self._random = RowPolicy(random, self._now[0], num_envs, first, seed)
         self.retrace(actor, mode)
