@@ -19,6 +19,7 @@ from pgkit.errors import UserError
 Function = Callable[..., Sequence[Tensor]]
 Find = Callable[[], list[Slot]]
 _MOST = 20_000  # operations that are worth compiling
+_WORDS = {"advance": "the step", "renew": "the resets"}
 
 
 class Call(NamedTuple):
@@ -106,6 +107,8 @@ class Recorded:
             return [x.contiguous() for x in (*results, *[found[paths[0]] for paths in self._paths])]
 
         others = [(None, *call.inputs, *self._state(call.before)) for call in calls]
+        if any(x.device.type != "cpu" for x in first.inputs):
+            raise RuntimeError("it is not on the CPU")
         if wrong := [call.wrong for call in calls if call.wrong]:
             raise RuntimeError(wrong[0])
         for call, arguments in zip(calls, others, strict=True):
@@ -218,7 +221,7 @@ def record(
     """The functions that can be recorded, by name; a log line for each that cannot.
 
     Args:
-        functions: of a twin, an object of the recording's own.
+        functions: of a twin, an object of the recording's own: its ``advance`` and its ``renew``.
         find: lists what the twin holds.
         play: calls the functions that it is given, in a way that takes all branches.
         num_envs: number of environments.
