@@ -98,6 +98,15 @@ PRESETS = {
     ),
 }  # fmt: skip
 
+SEARCH = {
+    "learning_rate": (5e-5, 2e-3, "log"),
+    "epochs": (5, 45),
+    "minibatch_size": [200, 400, 800],
+    "lmbda": (0.85, 0.98),
+    "entropy_coeff": [0.0, 1e-3, 1e-2],
+    "normalize_advantage": ["team", "agent", "minibatch"],
+}
+
 
 def group_agent(args: Args, env: envs.VectorEnv, group: str) -> run.Agent:
     """Networks, loss and advantage of one group."""

@@ -2,7 +2,7 @@
 
 from pgkit.compiled.branches import every_branch
 from pgkit.compiled.constants import Constants
-from pgkit.compiled.door import Compiled, Mode, check_compile, choose, compiled
+from pgkit.compiled.door import Compiled, Mode, check_compile, choose, compiled, has_compiler
 from pgkit.compiled.products import Matmul, load_matmul_state, matmul_state, set_matmul
 from pgkit.compiled.trial import undone
 
@@ -15,6 +15,7 @@ __all__ = [
     "choose",
     "compiled",
     "every_branch",
+    "has_compiler",
     "load_matmul_state",
     "matmul_state",
     "set_matmul",

@@ -18,6 +18,7 @@ from torch.fx import GraphModule, Node
 from torch.fx.experimental.proxy_tensor import make_fx
 from torch.fx.subgraph_rewriter import replace_pattern
 
+from pgkit.compiled.convolutions import halve_convolutions
 from pgkit.compiled.products import as_they_are, fastest_products
 
 # the same random numbers as eager code
@@ -55,7 +56,7 @@ def _mask_in_place(graph: GraphModule) -> None:
             views += [pick] if pick.target is aten.view.default else []  # of one picked element, without its dimension
             (pick,) = _with_dimensions(pick)
         same = pick.target is aten.index.Tensor and pick.args[1] == masks and len(pick.users) == 1
-        if not (same and _is_mask(masks, x) and pick.args[0].meta["val"].shape == x.meta["val"].shape):
+        if not (same and _is_mask(masks, x) and cast(Node, pick.args[0]).meta["val"].shape == x.meta["val"].shape):
             continue
         with graph.graph.inserting_before(pick):
             whole = graph.graph.call_function(aten.clone.default, (pick.args[0],))
@@ -130,6 +131,7 @@ def compile_record(graph: GraphModule, inputs: Sequence[Tensor]) -> Callable[...
 
     (results,) = graph.graph.output_node().args
     fastest_products(graph)
+    halve_convolutions(graph)
     constants = _as_inputs(graph)
     tensors, options = [*inputs, *constants], _OPTIONS
     if all(x.device.type == "cpu" for x in tensors):

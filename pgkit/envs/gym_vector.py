@@ -11,6 +11,7 @@ from torch import Tensor
 from torchrl.data import Composite
 
 from pgkit.envs import spaces
+from pgkit.envs.failures import FAILURES, fail, in_vector
 from pgkit.envs.numpy_entries import Info, Infos, Observations, Totals, flags, rewards
 from pgkit.envs.seeding import episode_seed
 from pgkit.errors import UserError
@@ -58,7 +59,10 @@ class GymnasiumVector:
         if seed is not None or not self._begun:
             first_time = seed is not None or not self._steps
             self.seed, self._steps = (self.seed, self._steps) if seed is None else (seed, 0)
-            obs, _ = self.env.reset(seed=self.seed if first_time else None)
+            try:
+                obs, _ = self.env.reset(seed=self.seed if first_time else None)
+            except FAILURES as error:
+                fail(in_vector(self.env, self.first, self.num_envs, 0, self.seed), error)
             self._fresh.write_all(obs, self.env.observation_space)
             self._totals.forget(np.ones(self.num_envs, bool))
             self._ended[:], self._begun = False, True
@@ -76,7 +80,11 @@ class GymnasiumVector:
         """As :meth:`pgkit.seams.Simulator.step`."""
         totals, counts = self._totals, ~self._ended if self.masks else None
         totals.forget(self._ended)
-        obs, reward, terminated, truncated, info = self.env.step(self.to_env(action["action"].numpy()))
+        actions = self.to_env(action["action"].numpy())
+        try:
+            obs, reward, terminated, truncated, info = self.env.step(actions)
+        except FAILURES as error:
+            fail(in_vector(self.env, self.first, self.num_envs, self._steps + 1, self.seed), error)
         totals.reward[:], totals.terminated[:], totals.truncated[:] = reward, terminated, truncated
         totals.count()
         if counts is not None:

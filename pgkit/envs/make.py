@@ -20,6 +20,7 @@ from pgkit.envs.agents import Names
 from pgkit.envs.gym_list import Gymnasium
 from pgkit.envs.gym_vector import GymnasiumVector
 from pgkit.envs.ids import is_atari, make_one, rendered
+from pgkit.envs.limits import limited
 from pgkit.envs.numpy_entries import Info
 from pgkit.envs.parallel import Parallel, is_parallel, refuse_turns
 from pgkit.envs.pixels import FrameStack, Pixels
@@ -45,6 +46,7 @@ class Settings(NamedTuple):
     reward_clipping: bool = False
     groups: Names | None = None
     compile: str = "off"
+    env_timeout: float | None = None
 
 
 def make(
@@ -64,6 +66,8 @@ def make(
     reward_clipping: bool | None = None,
     groups: Names | None = None,
     compile: str = "off",
+    env_timeout: float | None = None,
+    restart_workers: bool = False,
     **kwargs: Any,
 ) -> VectorEnv:
     """Makes a vector of environments.
@@ -91,6 +95,10 @@ def make(
             ``EnvBase``) and compiles it: about ten times as fast, after up to a minute the first time. What cannot be
             recorded runs as it is, with a line in the log; other environments have nothing to record. ``on``: then it
             is a ``UserError``.
+        env_timeout: seconds that one step of a process's environments may take; None: any time.
+        restart_workers: a worker process that has ended or hangs is replaced. Its environments go on where they were,
+            those that cannot (:attr:`~pgkit.seams.Simulator.resume`) begin new episodes. It costs the state of every
+            environment with every rollout.
         **kwargs: passed to ``gymnasium.make``, to the dm_control task, or to the function or class.
 
     Raises:
@@ -111,7 +119,7 @@ def make(
             what = f"workers={workers}" if workers > 1 else f"{next(iter(kwargs))}=..."
             raise UserError(f"{what} with an environment that is made already: give a function that makes one")
         images = (pixels, stack, fast_render, clips)
-        given = Settings(device, action_repeat, flatten, info, max_episode_steps, *images, groups, compile)
+        given = Settings(device, action_repeat, flatten, info, max_episode_steps, *images, groups, compile, env_timeout)
         return _adopt(env_id, num_envs, seed, given)
     num_envs = 1 if num_envs is None else num_envs
     if num_envs < 1 or workers < 1 or workers > num_envs:
@@ -127,10 +135,11 @@ def make(
     elif isinstance(env_id, str) and pixels is not None:
         kwargs = rendered(env_id, pixels) | kwargs
     images = (None if atari else pixels, stack, fast_render, clips)
-    limit = None if limited else max_episode_steps
-    settings = Settings(device, action_repeat, flatten, info, limit, *images, groups, compile)
+    steps = None if limited else max_episode_steps
+    settings = Settings(device, action_repeat, flatten, info, steps, *images, groups, compile, env_timeout)
     function = _function(env_id, kwargs)
-    env = VectorEnv(partial(_share, function, settings), num_envs, seed, workers)
+    env = VectorEnv(partial(_limited, function, settings), num_envs, seed, workers)
+    env.env_timeout, env.restart_workers = env_timeout, restart_workers
     env.env_id = env_id if isinstance(env_id, str) else getattr(env_id, "__qualname__", type(env_id).__name__)
     if action_repeat > 1:
         env.env_id += f" (action repeat {action_repeat})"
@@ -157,7 +166,10 @@ def _adopt(env: EnvBase | GymVectorEnv, num_envs: int | None, seed: int, setting
     """An environment that is there already."""
     if isinstance(env, VectorEnv):
         raise UserError("envs.make was given what envs.make gives: use it as it is")
-    adopted = VectorEnv(lambda first, count, seed: _simulator(env, seed, first, settings), 1, seed, splits=False)
+    adopted = VectorEnv(
+        lambda first, count, seed: limited(_simulator(env, seed, first, settings), settings.env_timeout),
+        1, seed, splits=False,
+    )  # fmt: skip
     if num_envs not in (None, adopted.num_envs):
         raise UserError(f"num_envs={num_envs}: the {type(env).__name__} given is {adopted.num_envs}: leave it out")
     adopted.env_id = type(env).__name__
@@ -175,6 +187,11 @@ def _function(env_id: Any, kwargs: dict[str, Any]) -> Callable[..., Any]:
             f"TorchRL EnvBase, this is a {type(env_id).__name__}: envs.make(lambda: ...)"
         )
     return partial(env_id, **kwargs)
+
+
+def _limited(function: Callable[..., Any], settings: Settings, first: int, count: int, seed: int) -> Simulator:
+    """As :func:`_share`, with the limit on the time of a step."""
+    return limited(_share(function, settings, first, count, seed), settings.env_timeout)
 
 
 def _share(function: Callable[..., Any], settings: Settings, first: int, count: int, seed: int) -> Simulator:

@@ -13,6 +13,7 @@ from torchrl.data import Bounded, Categorical, Composite
 from torchrl.envs import EnvBase
 
 from pgkit.compiled import Mode
+from pgkit.envs.failures import FAILURES, fail, in_vector
 from pgkit.envs.numpy_entries import as_path
 from pgkit.envs.seeding import episode_seed
 from pgkit.envs.spaces import ToEnv
@@ -137,7 +138,10 @@ class Torch:
         for key, x in action.items():
             x = x.clamp(*self._bounds[key]) if key in self._bounds else x.clone()
             data.set(key, x.squeeze(0) if self._one else x)
-        after, self._data = self._advance(data)
+        try:
+            after, self._data = self._advance(data)
+        except FAILURES as error:
+            fail(in_vector(innermost(self.env), self.first, self.num_envs, self._steps + 1, self.seed), error)
         self._untouched = False
         self._steps += 1
         reward = self._entries(after, self.reward_spec)
@@ -195,12 +199,15 @@ class Torch:
 
     def load_state_dict(self, state: dict[str, Any]) -> Entries:
         """Goes on exactly, or begins new episodes with a seed of their own."""
-        seed, begins = self.seed, self.resume == "new episodes" and state["steps"]
+        exact = self.resume == "exact" and "env" in state
+        seed, begins = self.seed, not exact and state["steps"]
         self._restart(episode_seed(seed, self.first, state["steps"]) if begins else seed)
         self.seed, self._steps = seed, state["steps"]
-        for env, own in zip(dict.fromkeys((self.env, innermost(self.env))), state["env"], strict=True):
+        for env, own in zip(
+            dict.fromkeys((self.env, innermost(self.env))), state.get("env", ()), strict="env" in state
+        ):
             env.load_state_dict(own)
-        if self.resume == "exact" and state["data"] is not None:
+        if exact and state["data"] is not None:
             self._data = TensorDict(state["data"], batch_size=self.env.batch_size, device=self.env.device)
             self.episode_reward, self.step_count, self._begun = state["counts"]
             return self._entries(self._data, self.observation_spec)

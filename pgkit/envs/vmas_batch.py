@@ -15,6 +15,7 @@ from torchrl.data import Composite
 
 from pgkit.compiled import Mode
 from pgkit.envs.agents import Group, Names, groups_of, rewards, under
+from pgkit.envs.failures import FAILURES, fail, in_vector
 from pgkit.envs.numpy_entries import flags
 from pgkit.envs.recorded import Function, Native, Recorded, falls_back, record
 from pgkit.envs.seeding import episode_seed
@@ -233,8 +234,11 @@ class Vmas:
     @torch.no_grad()
     def step(self, action: Entries) -> Step:
         """As :meth:`pgkit.seams.Simulator.step`; continuous actions are clipped to their bounds first."""
-        with self._stream:
-            made = self._call(self.advance, *[action[g.name, "action"] for g in self.groups])
+        try:
+            with self._stream:
+                made = self._call(self.advance, *[action[g.name, "action"] for g in self.groups])
+        except FAILURES as error:
+            fail(in_vector(self.env.scenario, 0, self.num_envs, self._steps + 1, self.seed), error)
         self._stepped = True
         self._steps += 1
         count = len(self.groups)
@@ -269,10 +273,10 @@ class Vmas:
     @torch.no_grad()
     def load_state_dict(self, state: dict[str, Any]) -> Entries:
         """Goes on exactly, or begins new episodes with a seed of their own."""
-        begins = self.resume == "new episodes" and state["steps"]
-        self._restart(episode_seed(state["seed"], 0, state["steps"]) if begins else state["seed"])
-        self.seed = state["seed"]
-        if self.resume == "new episodes":
+        exact, seed = self.resume == "exact" and "held" in state, state.get("seed", self.seed)
+        self._restart(seed if exact or not state["steps"] else episode_seed(seed, 0, state["steps"]))
+        self.seed = seed
+        if not exact:
             self._begin_counts()
             self._steps = state["steps"]
             return self._fresh

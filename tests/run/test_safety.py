@@ -8,6 +8,7 @@ import os
 import pickle
 import random
 import re
+import resource
 import shutil
 from pathlib import Path
 from types import SimpleNamespace
@@ -286,6 +287,21 @@ def test_a_full_disk_stops_no_training_and_leaves_no_half_file(
     with pytest.raises(UserError, match="cannot be written: No space left on device"):
         kit.train(arguments(kit, tmp_path / "s", total=30), hook=lambda _: monkeypatch.setattr(os, "fsync", full))
     assert not [path for path in (tmp_path / "s").rglob("*") if path.name.endswith(".part")]
+
+
+@pytest.mark.fault(
+    kind=20, injected="a limit amid a file (ulimit -f), as a full disk", outcome="one line, the old file stays"
+)
+def test_a_write_that_fails_amid_a_file_leaves_the_old_one(tmp_path: Path):
+    files.save(tmp_path / "x", {"a": 1})
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, hard))
+    try:
+        with pytest.raises(UserError, match="x cannot be written: File too large"):
+            files.save(tmp_path / "x", {"a": torch.zeros(100_000)})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert files.load(tmp_path / "x") == {"a": 1} and [path.name for path in tmp_path.iterdir()] == ["x"]
 
 
 def test_a_directory_that_goes_away_is_said_at_once_and_ends_the_run(kit: SimpleNamespace, tmp_path: Path, caplog: Any):
