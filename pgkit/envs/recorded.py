@@ -114,7 +114,10 @@ class Recorded:
         for call, arguments in zip(calls, others, strict=True):
             self._check(call, pure, arguments)
         door = compiled(every_branch(pure, *others[0]), {}, lambda *_: others[1:], mode, name, most=_MOST, fixed=True)
-        self._run = door.bind(*others[0])
+        try:
+            self._run = door.bind(*others[0])
+        except UserError as error:
+            raise RuntimeError(str(error.__cause__)) from error
         self.rung, self.seconds = door.rung, door.seconds
 
     def _state(self, values: dict[str, Any]) -> list[Tensor]:
