@@ -79,7 +79,8 @@ class Compiled:
         holds: further tensors that it changes or that change in place: optimizer state, priorities, a cache.
         agree: whether all of several learners took a rung, from whether this one did.
         most: operations that are worth compiling, of a function that may be a long loop; it skips ``torch.compile``.
-        fixed: refuses a record in which values decide how many elements something has.
+        fixed: refuses a record in which values decide how many elements something has, and to run the function as it
+            is: a ``UserError`` then, in every mode but ``off``.
 
     Attributes:
         seconds: spent recording and compiling so far.
@@ -132,7 +133,7 @@ class Compiled:
         failed: list[str] = []
         last: Exception | None = None
         for rung in _LADDERS[self.mode]:
-            if rung == TRACED and self.most is not None:
+            if (rung == TRACED and self.most is not None) or (rung == EAGER and self.fixed):
                 continue
             self.rung = rung
             bind = None

@@ -10,14 +10,14 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs import EnvBase
 
 from pgkit.compiled import Mode
 from pgkit.envs.failures import FAILURES, fail, in_vector
 from pgkit.envs.numpy_entries import as_path
 from pgkit.envs.seeding import episode_seed
 from pgkit.envs.spaces import ToEnv
-from pgkit.envs.torch_halves import native
+from pgkit.envs.torch_halves import innermost, native
 from pgkit.errors import UserError
 from pgkit.seams import Entries, Key, Step
 
@@ -57,7 +57,7 @@ class Torch:
         self._one = not env.batch_size
         self.num_envs = n = env.batch_size.numel()
         self.device = torch.device(env.device or "cpu")
-        self.resume: Literal["exact", "new episodes"] = getattr(type(_inner(env)), "resume", "new episodes")
+        self.resume: Literal["exact", "new episodes"] = getattr(type(innermost(env)), "resume", "new episodes")
         observed, infos = self._many(env.full_observation_spec), Composite(shape=(n,))
         keys = {_key(key): isinstance(observed[key].zero(), Tensor) for key in observed.keys(True, True)}
         if missing := [key for key in info if not keys.get(key)]:
@@ -141,7 +141,7 @@ class Torch:
         try:
             after, self._data = self._advance(data)
         except FAILURES as error:
-            fail(in_vector(_inner(self.env), self.first, self.num_envs, self._steps + 1, self.seed), error)
+            fail(in_vector(innermost(self.env), self.first, self.num_envs, self._steps + 1, self.seed), error)
         self._untouched = False
         self._steps += 1
         reward = self._entries(after, self.reward_spec)
@@ -188,7 +188,7 @@ class Torch:
 
     def state_dict(self) -> dict[str, Any]:
         """The environment's own state, and with ``resume = "exact"`` what its next step is made with."""
-        own = [copy.deepcopy(env.state_dict()) for env in dict.fromkeys((self.env, _inner(self.env)))]
+        own = [copy.deepcopy(env.state_dict()) for env in dict.fromkeys((self.env, innermost(self.env)))]
         state: dict[str, Any] = {"steps": self._steps, "env": own}
         if self.resume == "exact":
             state |= {
@@ -203,7 +203,9 @@ class Torch:
         seed, begins = self.seed, not exact and state["steps"]
         self._restart(episode_seed(seed, self.first, state["steps"]) if begins else seed)
         self.seed, self._steps = seed, state["steps"]
-        for env, own in zip(dict.fromkeys((self.env, _inner(self.env))), state.get("env", ()), strict="env" in state):
+        for env, own in zip(
+            dict.fromkeys((self.env, innermost(self.env))), state.get("env", ()), strict="env" in state
+        ):
             env.load_state_dict(own)
         if exact and state["data"] is not None:
             self._data = TensorDict(state["data"], batch_size=self.env.batch_size, device=self.env.device)
@@ -215,13 +217,6 @@ class Torch:
         """Closes the environment."""
         if not self.env.is_closed:
             self.env.close()
-
-
-def _inner(env: EnvBase) -> EnvBase:
-    """The environment under its transforms, whose ``state_dict`` leaves it out."""
-    while isinstance(env, TransformedEnv):
-        env = env.base_env
-    return env
 
 
 def _key(key: Any) -> Key:
