@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -10,7 +11,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from tensordict.utils import NestedKey
-from torch import Tensor
+from torch import Tensor, nn
 
 from pgkit.errors import UserError, within
 from pgkit.functional import listed, standardize
@@ -23,6 +24,8 @@ class Advantage(TensorDictModuleBase):
 
     A subclass says in :meth:`estimate` what they are. In one call, the critic reads every observation, and besides only
     the true final observations of episodes and the rollout's last: elsewhere the next value is the value one step on.
+
+    The critic is read in evaluation mode (no dropout, normalization by running statistics).
 
     **Many agents**: with a critic that writes ``("agents", "state_value")``, ``[*B, T, agents, 1]``, the results lie
     under the same name and have the same shape. Reward and flags are the group's own where the rollout has them, else
@@ -125,7 +128,8 @@ class Advantage(TensorDictModuleBase):
         if self.critic is None:
             value = next_value = torch.zeros_like(self._after(keys.reward, rollout))
         else:
-            value, next_value = self._values(self.critic, rollout)
+            with in_evaluation(self.critic):
+                value, next_value = self._values(self.critic, rollout)
             rollout.set(keys.value, value)
         values = ((x * scale).movedim(time, -2) for x in (value, next_value))
         advantage, target = (x.movedim(-2, time) for x in self.estimate(*values, rollout))
@@ -209,6 +213,19 @@ class Advantage(TensorDictModuleBase):
     def _axes(self, advantage: Tensor, time: int) -> list[int] | None:
         """Dimensions that are averaged over: all, or all but the agents'."""
         return [*range(time + 1), advantage.dim() - 1] if self.per_agent else None
+
+
+@contextmanager
+def in_evaluation(network: nn.Module) -> Iterator[None]:
+    """Within it no dropout draws, and no statistic moves."""
+    modes = [part for part in network.modules() if part.training]
+    for part in modes:
+        part.training = False
+    try:
+        yield
+    finally:
+        for part in modes:
+            part.training = True
 
 
 def as_values(x: Tensor, value: Tensor, rollout: TensorDictBase) -> Tensor:

@@ -11,7 +11,7 @@ from tensordict.nn import CompositeDistribution, TensorDictModule, set_composite
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from pgkit.advantages.base import Advantage, Keys, as_values
+from pgkit.advantages.base import Advantage, Keys, as_values, in_evaluation
 from pgkit.errors import within
 from pgkit.functional import listed, same_shape, vtrace
 
@@ -73,7 +73,8 @@ class VTrace(Advantage):
 
     def estimate(self, value: Tensor, next_value: Tensor, rollout: TensorDictBase) -> tuple[Tensor, Tensor]:
         if self.actor is not None:
-            dist = self.actor.get_dist(rollout.select(*self.actor.in_keys))
+            with in_evaluation(self.actor):
+                dist = self.actor.get_dist(rollout.select(*self.actor.in_keys))
             composite = isinstance(dist, CompositeDistribution)
             with set_composite_lp_aggregate(True):
                 actions = rollout if composite else rollout[self.actor.dist_sample_keys[0]]

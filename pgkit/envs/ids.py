@@ -6,6 +6,7 @@ import dataclasses
 import difflib
 import importlib
 import pkgutil
+import re
 import warnings
 from typing import Any
 
@@ -14,6 +15,12 @@ import gymnasium as gym
 from pgkit.envs.atari import make_atari
 from pgkit.envs.rendering import PACKAGES, choose_backend
 from pgkit.errors import UserError
+
+_PLUGINS = {  # ids that a package registers when it is imported
+    "MiniGrid-": "minigrid", "BabyAI-": "minigrid", "MiniWorld-": "miniworld", "highway-": "highway_env",
+    "Fetch": "gymnasium_robotics", "AntMaze": "gymnasium_robotics", "PointMaze": "gymnasium_robotics",
+    "Adroit": "gymnasium_robotics", "FrankaKitchen": "gymnasium_robotics", "Meta-World/": "metaworld",
+}  # fmt: skip
 
 
 def make_one(env_id: str, **kwargs: Any) -> Any:
@@ -43,9 +50,13 @@ def make_one(env_id: str, **kwargs: Any) -> Any:
     except gym.error.Error as error:
         raise UserError(f"environment '{env_id}': {str(error).splitlines()[0]}") from error
     except TypeError as error:
-        if not kwargs or "argument" not in str(error):
+        if not re.search(r"missing \d+ required|unexpected keyword argument", str(error)):
             raise
-        raise UserError(f"environment '{env_id}' cannot be made with these settings: {error}") from error
+        reason = str(error).partition(" was raised from")[0]
+        raise UserError(
+            f"environment '{env_id}' cannot be made with these settings: {reason}; --env.KEYWORD VALUE (envs.make(..., "
+            "keyword=value)) gives one"
+        ) from error
 
 
 def _make_mpe2(env_id: str, max_episode_steps: int | None = None, **kwargs: Any) -> Any:
@@ -77,7 +88,9 @@ def _not_installed(env_id: str, error: Exception) -> UserError:
     if colon and getattr(cause, "name", None) not in (None, module):
         return UserError(f"environment '{env_id}': importing '{module}' failed ({cause})")
     if colon:
-        return UserError(f"environment '{env_id}': no module '{module}' to import, neither here nor installed")
+        return UserError(
+            f"environment '{env_id}': no module '{module}' to import, neither here nor installed (pip install {module})"
+        )
     if newest := _successor(env_id):
         return UserError(f"environment '{env_id}' is one of Gymnasium's former ones: use {newest}")
     reason = str(error).splitlines()[0].rstrip(".")
@@ -133,7 +146,12 @@ def _make_dm_control(env_id: str, **kwargs: Any) -> gym.Env:
 def _unknown(env_id: str, known: list[str]) -> UserError:
     nearest = difflib.get_close_matches(env_id, known, n=3, cutoff=0.4)
     hint = f"; the nearest names are {', '.join(nearest)}" if nearest else "; see gymnasium.pprint_registry()"
-    return UserError(f"unknown environment id '{env_id}'{hint}; where a package registers it: PACKAGE:{env_id}")
+    package, _, name = env_id.rpartition(":")
+    package = package or next((x for start, x in _PLUGINS.items() if env_id.startswith(start)), "PACKAGE")
+    where = (
+        f"give the package that registers it, {package}:{name}" if package not in env_id else f"'{package}' is imported"
+    )
+    return UserError(f"unknown environment id '{env_id:.100}'{hint}; {where}")
 
 
 def _extra(env_id: str) -> str:

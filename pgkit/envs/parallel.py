@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import gymnasium as gym
@@ -12,7 +12,9 @@ from torch import Tensor
 from torchrl.data import Categorical, Composite
 
 from pgkit.envs.agents import Group, Names, groups_of, rewards, under
+from pgkit.envs.checks import WRONG, checked_flag, checked_reward, misshapen
 from pgkit.envs.numpy_entries import flags
+from pgkit.envs.parts import numbers
 from pgkit.envs.seeding import episode_seed
 from pgkit.envs.spaces import ToEnv, to_env
 from pgkit.errors import UserError
@@ -48,16 +50,26 @@ class Parallel:
         seed: the run's seed.
         first: index of the first one, where this is a share of a larger vector.
         groups: names of agents by the name of their group; None: one, or by their names where their spaces differ.
+        reseed, options: as for :class:`~pgkit.envs.Gymnasium`.
     """
 
     device = torch.device("cpu")
-    resume: Literal["exact", "new episodes"] = "exact"
     masks = False
 
-    def __init__(self, envs: Sequence[ParallelEnv], seed: int = 0, first: int = 0, groups: Names | None = None) -> None:
+    def __init__(
+        self,
+        envs: Sequence[ParallelEnv],
+        seed: int = 0,
+        first: int = 0,
+        groups: Names | None = None,
+        reseed: bool = True,
+        options: Mapping[str, Any] | None = None,
+    ) -> None:
         if len({id(env) for env in envs}) < len(envs):
             raise UserError("the function that makes an environment gave the same one twice: it must make a new one")
         self.envs: Sequence[Any] = envs
+        self.reseed, self.options = reseed, None if options is None else dict(options)
+        self.resume: Literal["exact", "new episodes"] = "exact" if reseed else "new episodes"
         self.num_envs, self.first, one, n = len(envs), first, envs[0], len(envs)
         spaces = ({a: space(a) for a in one.possible_agents} for space in (one.observation_space, one.action_space))
         self.groups = groups_of(type(one).__name__, *spaces, groups)
@@ -97,6 +109,7 @@ class Parallel:
     def _restart(self, seed: int) -> None:
         self.seed = seed
         self._begun = np.zeros(self.num_envs, bool)  # the episode was begun and has not been stepped since
+        self._seeded = np.zeros(self.num_envs, bool)
         self._episode = np.full(self.num_envs, -1)
         self._taken: list[list[list[np.ndarray]]] = [[] for _ in self.envs]  # actions of the running episodes
 
@@ -111,13 +124,17 @@ class Parallel:
 
     def _begin(self, i: int) -> None:
         self._episode[i] += 1
-        result = self.envs[i].reset(seed=episode_seed(self.seed, self.first + i, int(self._episode[i])))
-        if not isinstance(result, tuple) or len(result) != 2:
+        given: dict[str, Any] = {} if self.options is None else {"options": dict(self.options)}
+        if self.reseed or not self._seeded[i]:
+            given["seed"] = episode_seed(self.seed, self.first + i, int(self._episode[i]))
+            self._seeded[i] = True
+        result = self.envs[i].reset(**given)
+        if not isinstance(result, tuple) or len(result) != 2 or not isinstance(result[0], dict):
             raise UserError(
-                f"{type(self.envs[i]).__name__}.reset returned a {type(result).__name__}: return (observations, infos)"
+                f"{type(self.envs[i]).__name__}.reset returned a {type(result).__name__}: return (observations, "
+                "infos), dicts by the agents' names"
             )
-        for team in self._teams:
-            team.observe(team.fresh, i, result[0], self.envs[i].agents)
+        self._observe("reset", i, result[0], self.envs[i].agents)
         self._begun[i], self._taken[i] = True, []
 
     def step(self, action: Entries) -> Step:
@@ -131,7 +148,8 @@ class Parallel:
         for i in range(self.num_envs):
             given = [x[i] for x in actions]
             self._one_step(i, given)
-            self._taken[i].append(given)
+            if self.reseed:
+                self._taken[i].append(given)
         for team in self._teams:
             team.fresh.copy_from(team.next)
         for i in np.flatnonzero(self._terminated | self._truncated):
@@ -153,14 +171,32 @@ class Parallel:
                 "truncations, infos), dicts by the agents' names"
             )
         observations, reward, terminated, truncated, _ = result
+        self._check(env, acting, result)
         over = not env.agents or all(terminated.get(x) or truncated.get(x) for x in env.agents)
         cut = over and any(truncated.get(x) and not terminated.get(x) for x in acting)
         self._truncated[i], self._terminated[i] = cut, over and not cut
         present = [x for x in env.agents if not (terminated.get(x) or truncated.get(x))]
+        self._observe("step", i, observations, present)
         for team in self._teams:
-            team.observe(team.next, i, observations, present)
-            team.write(i, acting, reward, terminated, truncated)
+            team.write(env, i, acting, reward, terminated, truncated)
         self._steps[i] += 1
+
+    def _observe(self, method: str, i: int, observations: dict[str, Any], present: Sequence[str]) -> None:
+        for team in self._teams:
+            try:
+                team.observe(team.next if method == "step" else team.fresh, i, observations, present)
+            except WRONG as error:
+                raise misshapen(self.envs[i], method, error) from error
+
+    def _check(self, env: Any, acting: set[str], result: tuple[Any, ...]) -> None:
+        """A ``UserError`` for what is no dict of the agents that acted."""
+        for what, x in zip(("observations", "rewards", "terminations", "truncations"), result, strict=False):
+            missing = acting - x.keys() if isinstance(x, dict) else acting
+            if missing:
+                raise UserError(
+                    f"{type(env).__name__}.step returned no {what} of agent '{min(missing)}', which acted: return a "
+                    "dict with all agents that acted"
+                )
 
     def state_dict(self) -> dict[str, Any]:
         """Of every environment the number of its episode and the actions since that began, by group."""
@@ -173,6 +209,9 @@ class Parallel:
     def load_state_dict(self, state: dict[str, Any]) -> Entries:
         """Restores every environment by replaying the actions of its current episode."""
         self._restart(state["seed"])
+        if not self.reseed:
+            self._episode[:] = [row["episode"] for row in state["rows"]]
+            return self.reset()
         for i, row in enumerate(state["rows"]):
             self._episode[i] = max(row["episode"], 0) - 1
             self._begin(i)
@@ -226,21 +265,23 @@ class _Team:
         for place, name in enumerate(self.members):
             there = name in present
             rows.arrays["mask"][i, place] = there
-            seen = observations.get(name)
+            seen = observations[name] if there else observations.get(name)
             if "action_mask" in rows.arrays:
                 rows.arrays["action_mask"][i, place] = True if seen is None else seen["action_mask"]
                 seen = None if seen is None else seen["observation"]
                 if not rows.arrays["action_mask"][i, place].any() and not there:
                     rows.arrays["action_mask"][i, place] = True  # of one that does not act any more
-            rows.arrays["observation"][i, place] = 0 if seen is None else self.group.observation.read(seen)
+            entry = self.group.observation
+            gone = seen is None and not there
+            rows.arrays["observation"][i, place] = 0 if gone else numbers(entry.read(seen), entry.shape)
 
-    def write(self, i: int, acting: set[str], reward: dict, terminated: dict, truncated: dict) -> None:
+    def write(self, env: Any, i: int, acting: set[str], reward: dict, terminated: dict, truncated: dict) -> None:
         """Writes the rewards and flags of row ``i``; agents that are gone stay terminated, or cut off."""
         for place, name in enumerate(self.members):
             acted = name in acting
-            self.reward[i, place] = float(reward.get(name, 0.0)) if acted else 0.0
-            self.terminated[i, place] = bool(terminated.get(name, False)) if acted else True
-            self.truncated[i, place] = bool(truncated.get(name, False)) if acted else False
+            self.reward[i, place] = checked_reward(env, reward[name]) if acted else 0.0
+            self.terminated[i, place] = checked_flag(env, "terminated", terminated[name]) if acted else True
+            self.truncated[i, place] = checked_flag(env, "truncated", truncated[name]) if acted else False
         self.total[i] += self.reward[i]
 
 

@@ -49,6 +49,9 @@ class PolicyLoss(Loss):
     and gives subclasses verbs: :meth:`distribution`, :meth:`log_prob`, :meth:`log_ratio`, :meth:`kl`, :meth:`value`;
     and :meth:`result`, or its parts :meth:`add_entropy` and :meth:`add_critic`.
 
+    The actor is evaluated in evaluation mode (no dropout, normalization by running statistics), as it collects: the
+    first ratio is 1. The critic keeps the mode that it was given in.
+
     Args:
         actor_network: probabilistic actor.
         critic_network: value operator; None leaves the value loss out.
@@ -103,6 +106,7 @@ class PolicyLoss(Loss):
     ) -> None:
         super().__init__(reduction)
         self.convert_to_functional(actor_network, "actor_network")
+        self.actor_network.eval()
         need_distribution(type(self).__name__, actor_network, "modules.gaussian_actor, modules.actor")
         if critic_network is None or not critic_coeff:
             self.critic_network = None

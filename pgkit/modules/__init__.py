@@ -16,6 +16,7 @@ from pgkit.modules.normalizers import ObsNormalizer, ReturnScale
 from pgkit.modules.q_values import QValue, discrete_q_value, q_value
 from pgkit.modules.recurrent import gru, lstm
 from pgkit.modules.tokens import TokenActor, TokenDistribution, TokenPolicy, TokenValue
+from pgkit.modules.trunk import FlatMatrix
 from pgkit.modules.values import state_value
 
 __all__ = [
@@ -26,6 +27,7 @@ __all__ = [
     "EnsembleDropout",
     "EnsembleLayerNorm",
     "EnsembleLinear",
+    "FlatMatrix",
     "GaussianExploration",
     "ObsNormalizer",
     "OrnsteinUhlenbeck",

@@ -46,13 +46,16 @@ def trunk(
 ) -> Trunk:
     """The modules before a head: normalizer, all agents' observations side by side, agent ids, hidden layers.
 
-    An encoder stands in place of the hidden layers, right after the normalizer.
+    An encoder stands in place of the hidden layers, right after the normalizer. Without one, a matrix is flattened.
     """
     key = who.key("observation") if isinstance(centralized, bool) else centralized
     before = [] if normalizer is None else [normalizer]
     between, after, width = _team(who, centralized)
     if encoder is None:
-        size = width * flat_size(who.observation(key).shape, key) + who.number * who.ids
+        shape = who.observation(key).shape
+        if len(shape) == 2:
+            before, shape = [*before, FlatMatrix()], (shape.numel(),)
+        size = width * flat_size(shape, key) + who.number * who.ids
         layers = mlp(size, None, hidden, activation, linear=who.linear)
         return Trunk([*before, *between, layers], list(hidden)[-1] if hidden else size, [key], [], after)
     keys, states = reads(encoder, key), list(getattr(encoder, "out_keys", []))
@@ -65,6 +68,13 @@ def trunk(
         raise UserError("agent_ids= and centralized= go to the recurrent encoder's builder, which comes first")
     features = width * _features(who, encoder, keys) + who.number * who.ids
     return Trunk([*before, encoder, *between], features, keys, states, after)
+
+
+class FlatMatrix(nn.Module):
+    """Matrices ``[*B, rows, columns]`` as vectors ``[*B, rows * columns]``; bytes become floats."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return (x if x.is_floating_point() else x.to(torch.get_default_dtype())).flatten(-2)
 
 
 def headed(

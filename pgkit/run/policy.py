@@ -34,7 +34,7 @@ class Policy:
 
     def __post_init__(self) -> None:
         self._acting = Acting(self.actor, (self.action_key,))
-        self._begins = True
+        self._begins, self._recurrent, self._reads = True, self.memory is not None, self.shapes
 
     @classmethod
     def of(cls, actor: torch.nn.Module, env: Any) -> Policy:
@@ -69,18 +69,36 @@ class Policy:
         """An episode begins at the next :meth:`predict`: a recurrent policy forgets. No other needs it."""
         self._acting.state, self._begins = None, True
 
-    def predict(self, obs: Any, deterministic: bool = True) -> np.ndarray:
+    def predict(self, obs: Any, deterministic: bool = True, episode_start: Any = None) -> np.ndarray:
         """Action for one observation ``[*obs]``, or actions ``[N, *action]`` for a batch ``[N, *obs]``.
 
         Where the policy reads the entries of a Dict, ``obs`` is a mapping from their names to arrays. The actions are
-        what the environment takes: continuous ones are clipped to its bounds. A wrong shape is a UserError.
+        what the environment takes: continuous ones are clipped to its bounds.
+
+        Args:
+            obs: numbers; a wrong shape is a UserError.
+            deterministic: the likeliest actions, or draws.
+            episode_start: flags ``[N]``, which rows begin an episode: there a recurrent policy forgets. None: all at
+                the first call and after :meth:`reset`, else none.
+
+        Raises:
+            UserError: wrong shapes; or a recurrent policy is given other rows in the middle of their episodes.
         """
-        shapes = self.shapes
+        entries, single = self._entries(obs)
+        rows = len(next(iter(entries.values())))
+        begun = self._begun(rows, episode_start)
+        action = self._acting(entries, begun, deterministic)[self.action_key].cpu().numpy()
+        self._begins = False
+        action = action if self.to_env is None else self.to_env(action)
+        return action[0] if single else action
+
+    def _entries(self, obs: Any) -> tuple[dict[Key, torch.Tensor], bool]:
+        """What the actor reads as a batch, and whether it was a single observation."""
         given = obs if isinstance(obs, Mapping) else {"observation": obs}
         entries, single = {}, False
-        for name, shape in shapes.items():
+        for name, shape in self._reads.items():
             if name not in given:
-                had, reads = (", ".join(map(dotted, keys)) for keys in (given, shapes))
+                had, reads = (", ".join(map(dotted, keys)) for keys in (given, self._reads))
                 raise UserError(f"predict got {had}; the policy takes the entries {reads}")
             x = np.asarray(given[name], dtype=self.dtype(name))
             single = x.shape == shape
@@ -89,11 +107,24 @@ class Policy:
                     f"predict got an {dotted(name)} of shape {list(x.shape)}; the policy takes {list(shape)} or a batch"
                 )
             entries[name] = torch.from_numpy(x[None] if single else x)
-        begun = torch.full((len(next(iter(entries.values()))),), self._begins)
-        action = self._acting(entries, begun, deterministic)[self.action_key].cpu().numpy()
-        self._begins = False
-        action = action if self.to_env is None else self.to_env(action)
-        return action[0] if single else action
+        return entries, single
+
+    def _begun(self, rows: int, episode_start: Any) -> torch.Tensor:
+        if episode_start is None:
+            begun = torch.full((rows,), self._begins)
+        else:
+            begun = torch.as_tensor(np.array(episode_start, bool).reshape(-1))
+            if len(begun) != rows:
+                raise UserError(
+                    f"predict got {len(begun)} flags of episode_start for {rows} observations: one for each"
+                )
+        state = self._acting.state if self._recurrent else None
+        if state is not None and len(state) != rows and not begun.all():
+            raise UserError(
+                f"predict got {rows} observations after {len(state)}, and this policy remembers each row's episode: "
+                "call reset(), or give episode_start=, one flag a row, all True where the rows are others"
+            )
+        return begun
 
 
 def dotted(key: Key) -> str:
