@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -11,10 +10,11 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from tensordict.utils import NestedKey
-from torch import Tensor, nn
+from torch import Tensor
 
 from pgkit.errors import UserError, within
 from pgkit.functional import listed, standardize
+from pgkit.functional.modes import in_evaluation
 
 Keys = NestedKey | list[NestedKey]
 
@@ -213,19 +213,6 @@ class Advantage(TensorDictModuleBase):
     def _axes(self, advantage: Tensor, time: int) -> list[int] | None:
         """Dimensions that are averaged over: all, or all but the agents'."""
         return [*range(time + 1), advantage.dim() - 1] if self.per_agent else None
-
-
-@contextmanager
-def in_evaluation(network: nn.Module) -> Iterator[None]:
-    """Within it no dropout draws, and no statistic moves."""
-    modes = [part for part in network.modules() if part.training]
-    for part in modes:
-        part.training = False
-    try:
-        yield
-    finally:
-        for part in modes:
-            part.training = True
 
 
 def as_values(x: Tensor, value: Tensor, rollout: TensorDictBase) -> Tensor:

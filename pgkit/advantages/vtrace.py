@@ -11,9 +11,10 @@ from tensordict.nn import CompositeDistribution, TensorDictModule, set_composite
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from pgkit.advantages.base import Advantage, Keys, as_values, in_evaluation
+from pgkit.advantages.base import Advantage, Keys, as_values
 from pgkit.errors import within
 from pgkit.functional import listed, same_shape, vtrace
+from pgkit.functional.modes import in_evaluation
 
 
 class VTrace(Advantage):

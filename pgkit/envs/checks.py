@@ -20,6 +20,21 @@ WRONG = (
 )  # what reading an observation raises that is not of its space
 
 
+def checked_space(env: gym.Env, name: str) -> gym.Space:
+    """The environment's ``observation_space`` or ``action_space``; a ``UserError`` where it is none."""
+    try:
+        space: Any = env.get_wrapper_attr(name)
+    except AttributeError:
+        space = None
+    if not isinstance(space, gym.Space):
+        found = "missing" if space is None else f"a {type(space).__module__}.{type(space).__name__}"
+        raise UserError(
+            f"{_name(env)}.{name} is {found}, no gymnasium.spaces.Space: give one (an environment of the old gym: "
+            "shimmy's gymnasium.make('GymV26Environment-v0', env_id=...))"
+        )
+    return space
+
+
 def checked_reset(env: gym.Env, seed: int | None, options: dict[str, Any] | None) -> Any:
     """The observation of ``env.reset(seed=seed)``; a ``UserError`` where it does not return what Gymnasium asks for."""
     given: dict[str, Any] = {"seed": seed} if options is None else {"seed": seed, "options": dict(options)}

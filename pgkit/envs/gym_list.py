@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl.data import Composite
 
 from pgkit.envs import spaces
-from pgkit.envs.checks import FLAGS, NUMBERS, WRONG, check_step, checked_reset, misshapen
+from pgkit.envs.checks import FLAGS, NUMBERS, WRONG, check_step, checked_reset, checked_space, misshapen
 from pgkit.envs.numpy_entries import Info, Infos, Observations, Totals, flags, rewards
 from pgkit.envs.seeding import episode_seed
 from pgkit.errors import UserError
@@ -57,11 +57,12 @@ class Gymnasium:
         self.envs, self.num_envs, self.first, self.clip_rewards = envs, len(envs), first, clip_rewards
         self.reseed, self.options = reseed, None if options is None else dict(options)
         self.resume: Literal["exact", "new episodes"] = "exact" if reseed else "new episodes"
-        entries = spaces.observation_entries(envs[0].observation_space, flatten)
-        self.to_env = spaces.to_env(envs[0].action_space)
+        observed, acted = (checked_space(envs[0], name) for name in ("observation_space", "action_space"))
+        entries = spaces.observation_entries(observed, flatten)
+        self.to_env = spaces.to_env(acted)
         n = self.num_envs
         self.observation_spec = Composite({entry.key: entry.spec(n) for entry in entries}, shape=(n,))
-        self.action_spec = Composite(action=spaces.action_spec(envs[0].action_space, n), shape=(n,))
+        self.action_spec = Composite(action=spaces.action_spec(acted, n), shape=(n,))
         self.reward_spec, self.done_spec = rewards(n), flags(n)
         self._fresh, self._next, self._infos = Observations(entries, n), Observations(entries, n), Infos(info, n)
         self.info_spec, self._totals = self._infos.spec, Totals(n)

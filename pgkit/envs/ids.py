@@ -148,10 +148,8 @@ def _unknown(env_id: str, known: list[str]) -> UserError:
     hint = f"; the nearest names are {', '.join(nearest)}" if nearest else "; see gymnasium.pprint_registry()"
     package, _, name = env_id.rpartition(":")
     package = package or next((x for start, x in _PLUGINS.items() if env_id.startswith(start)), "PACKAGE")
-    where = (
-        f"give the package that registers it, {package}:{name}" if package not in env_id else f"'{package}' is imported"
-    )
-    return UserError(f"unknown environment id '{env_id:.100}'{hint}; {where}")
+    registers = f"{package}:{name:.100}"
+    return UserError(f"unknown environment id '{env_id:.100}'{hint}; where a package registers it: {registers}")
 
 
 def _extra(env_id: str) -> str:

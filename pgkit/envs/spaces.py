@@ -61,11 +61,6 @@ def observation_entries(space: gym.Space, flatten: bool = True) -> list[Entry]:
         UserError: the space holds no numbers; or with ``flatten=False``, it is no Dict, or an entry has a name
             that rollouts use.
     """
-    if not isinstance(space, gym.Space):
-        raise UserError(
-            f"the observation space is a {type(space).__module__}.{type(space).__name__}, no gymnasium.spaces.Space: "
-            "give one (an environment of the old gym: gymnasium.make('GymV26Environment-v0', env_id=...) of shimmy)"
-        )
     if not flatten:
         return _apart(space)
     if isinstance(space, spaces.Box):
@@ -199,4 +194,4 @@ def action_spec(space: gym.Space, num_envs: int) -> TensorSpec:
 
 
 def _not_supported(space: gym.Space) -> UserError:
-    return UserError(f"action space {space} is not supported: Box, Discrete, MultiDiscrete and MultiBinary are")
+    return UserError(f"action space {space!s:.100} is not supported: Box, Discrete, MultiDiscrete and MultiBinary are")

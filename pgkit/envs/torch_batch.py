@@ -159,11 +159,11 @@ class Torch:
         terminated, truncated = {}, {}
         for path in self._ends:
             done, ended = after.get((*path, "done")), after.get((*path, "terminated"), None)
-            ended = done if ended is None else ended
-            cut = after.get((*path, "truncated"), None)
+            ended, cut = done if ended is None else ended, after.get((*path, "truncated"), None)
+            for name, x in (("done", done), ("terminated", ended), ("truncated", done if cut is None else cut)):
+                if x.dtype != torch.bool or x.shape != done.shape:
+                    raise self._wrong((*path, name), x, f"bool {tuple(done.shape)}")
             cut = done & ~ended if cut is None else cut
-            if done.dtype != torch.bool or {ended.shape, cut.shape, done.shape} != {done.shape}:
-                raise self._wrong((*path, "done"), done, "flags, terminated and truncated alike")
             both = (ended.unsqueeze(0), cut.unsqueeze(0)) if self._one else (ended, cut)
             terminated[_key((*path, "terminated"))], truncated[_key((*path, "truncated"))] = both
         return terminated, truncated

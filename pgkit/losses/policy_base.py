@@ -23,6 +23,7 @@ from pgkit.functional import (
     standardize,
     value_loss,
 )
+from pgkit.functional.modes import in_evaluation
 from pgkit.functional.values import Distance
 from pgkit.losses.actors import need_distribution
 from pgkit.losses.base import Loss
@@ -106,7 +107,6 @@ class PolicyLoss(Loss):
     ) -> None:
         super().__init__(reduction)
         self.convert_to_functional(actor_network, "actor_network")
-        self.actor_network.eval()
         need_distribution(type(self).__name__, actor_network, "modules.gaussian_actor, modules.actor")
         if critic_network is None or not critic_coeff:
             self.critic_network = None
@@ -127,7 +127,7 @@ class PolicyLoss(Loss):
 
     def distribution(self, batch: TensorDictBase) -> Distribution:
         """The policy's distribution at the batch's observations; the batch is left as it is."""
-        with self.actor_network_params.to_module(self.actor_network):
+        with self.actor_network_params.to_module(self.actor_network), in_evaluation(self.actor_network):
             entries = batch.select(*self.actor_network.in_keys, strict=False)  # a composite's "params" it writes itself
             return self.actor_network.get_dist(entries)
 
@@ -158,8 +158,9 @@ class PolicyLoss(Loss):
 
     def keep_distribution(self, batch: TensorDictBase) -> TensorDictBase:
         """Writes the policy's distribution into the batch (``loc`` and ``scale``, or ``logits``), as of now."""
-        with torch.no_grad(), self.actor_network_params.to_module(self.actor_network):
-            out = self.actor_network.get_dist_params(batch.select(*self.actor_network.in_keys))
+        actor = self.actor_network
+        with torch.no_grad(), self.actor_network_params.to_module(actor), in_evaluation(actor):
+            out = actor.get_dist_params(batch.select(*actor.in_keys))
         return batch.update(out.select(*self.distribution_keys))
 
     @property

@@ -11,6 +11,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from pgkit.errors import UserError
+from pgkit.functional.modes import in_evaluation
 from pgkit.modules.groups import AgentIds, Agents, AllAgents, ForEachAgent
 from pgkit.modules.mlp import mlp
 from pgkit.modules.sizes import flat_size, observation_spec
@@ -146,19 +147,14 @@ def _features(who: Agents, encoder: Any, keys: Sequence[NestedKey]) -> int:
     """How many features an encoder gives for an observation."""
     device = next((p.device for p in encoder.parameters()), who.device)
     examples = [_zero(who, encoder, key).to(device) for key in keys]
-    modes = {module: module.training for module in encoder.modules()}
-    encoder.eval()  # a batch of zeros is no statistic
     try:
-        with torch.no_grad():
+        with torch.no_grad(), in_evaluation(encoder):  # a batch of zeros is no statistic
             out = first(encoder(*examples))
     except (RuntimeError, ValueError, TypeError) as error:
         found = ", ".join(str(tuple(x.shape)) for x in examples)
         raise UserError(
             f"encoder={type(encoder).__name__} cannot take an observation {found}: {str(error).splitlines()[0]}"
         ) from error
-    finally:
-        for module, training in modes.items():
-            module.training = training
     size = (1,) if who.name is None or isinstance(keys[0], str) else (1, who.number)
     if out.shape[:-1] != size:
         raise UserError(

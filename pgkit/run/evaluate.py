@@ -17,23 +17,12 @@ from pgkit.collectors.policy import Act, trace
 from pgkit.compiled import Constants
 from pgkit.envs import vector_of
 from pgkit.errors import check_whole_number
+from pgkit.functional.modes import in_evaluation
 from pgkit.run.seeding import preserved_rng
 from pgkit.seams import Entries, Key
 
 RECORDED_AT, MOST_RECORDS = 20, 8  # calls of one layout before it is recorded, which takes 0.1 s; layouts
 LONG_EPISODE = 100_000  # steps; longer than those of Gymnasium, dm_control and Atari
-
-
-@contextmanager
-def _evaluating(policy: torch.nn.Module) -> Iterator[None]:
-    training = [part for part in policy.modules() if part.training]
-    for part in training:
-        part.training = False
-    try:
-        yield
-    finally:
-        for part in training:
-            part.training = True
 
 
 @contextmanager
@@ -104,7 +93,7 @@ class Acting:
 
         def act(*inputs: Tensor) -> list[Tensor]:
             data = TensorDict(dict(zip(keys, inputs, strict=True)), inputs[0].shape[:1])
-            with _evaluating(self.policy), set_exploration_type(kind):
+            with in_evaluation(self.policy), set_exploration_type(kind):
                 out = self.policy(data)
             found = [out[key] for key in self.keys]
             none = torch.empty(0)
@@ -134,7 +123,7 @@ def play(policy: Any, env: Any, episodes: int, deterministic: bool = True) -> tu
     check_whole_number(1, episodes=episodes)
     env = vector_of(env)
     policy = policy if isinstance(policy, torch.nn.Module) else policy.actor
-    with preserved_rng(), _evaluating(policy), _one_thread():
+    with preserved_rng(), in_evaluation(policy), _one_thread():
         simulator, act = env.simulator, Acting(policy, tuple(env.action_keys))
         fresh, slots = simulator.reset(), simulator.num_envs
         share = [episodes // slots + (slot < episodes % slots) for slot in range(slots)]
