@@ -27,8 +27,9 @@ HEAD = """# Reliability
 What is done to pgkit on purpose, and what it then does. Each row is a test of that name, which injects the fault and
 checks the outcome; `python tests/reliability.py` writes this page from them. `pytest -k NAME` runs one.
 
-Three answers are allowed. A mistake that one line can explain is a `UserError`: the command line prints the line and exits
-with code 2. A training that diverged exits with code 3. Everything else is repaired, and the numbers stay what they were.
+Three answers are allowed. A mistake that one line can explain is a `UserError`: the command line prints that line and
+exits with code 2. A training that diverged exits with code 3. Everything else is repaired, and the numbers stay as they
+were.
 """
 
 

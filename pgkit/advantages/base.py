@@ -123,6 +123,8 @@ class Advantage(TensorDictModuleBase):
     @torch.no_grad()
     def forward(self, rollout: TensorDictBase) -> TensorDictBase:
         """Reads and returns ``rollout``, which has time as its last batch dimension."""
+        if not rollout.batch_size.numel():
+            raise UserError(f"{type(self).__name__} got an empty rollout {list(rollout.batch_size)}: give it steps")
         keys, time = self.tensor_keys, rollout.batch_dims - 1
         scale = 1.0 if self.return_scale is None else self.return_scale.scale
         if self.critic is None:

@@ -476,7 +476,7 @@ def test_entries_without_numbers_are_left_out(said: pytest.LogCaptureFixture):
 def test_flat_observations_are_gymnasiums():
     space = spaces.Dict(
         b=spaces.MultiDiscrete([2, 3], start=[1, 4]), a=spaces.Discrete(3, start=-1), c=spaces.MultiBinary((2, 2)),
-        d=spaces.Tuple((VECTOR, spaces.Dict(x=spaces.Box(-1, 1, (2, 2), np.float64)))), e=spaces.MultiDiscrete([[2, 3]]),
+        d=spaces.Tuple((VECTOR, spaces.Dict(x=spaces.Box(-1, 1, (2, 2))))), e=spaces.MultiDiscrete([[2, 3]]),
     )  # fmt: skip
     space.seed(0)
     from pgkit.envs.spaces import observation_entries
