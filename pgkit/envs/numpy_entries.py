@@ -59,6 +59,8 @@ class Infos:
 
     def __init__(self, wanted: Info, num_envs: int) -> None:
         wanted = [wanted] if isinstance(wanted, str) else wanted
+        if not isinstance(wanted, Sequence | Mapping) or not all(isinstance(key, str | tuple) for key in wanted):
+            raise UserError(f"info={wanted!r:.60}: give names of entries, info=('is_success',)")
         specs = dict(wanted) if isinstance(wanted, Mapping) else dict.fromkeys(wanted, None)
         if taken := [key for key in specs if as_path(key)[0] in TAKEN]:
             raise UserError(f"info={taken[0]!r}: rollouts have an entry of that name: rename it in a wrapper")

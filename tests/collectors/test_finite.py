@@ -13,7 +13,7 @@ from pgkit.errors import UserError
 
 
 class Once(gym.Env):
-    """A random walk; step ``at`` of the environment that was made ``which``-th observes or gives what ``wrong`` says."""
+    """A random walk; in step ``at`` of the ``which``-th environment, ``wrong`` says what comes."""
 
     observation_space, action_space = gym.spaces.Box(-9, 9, (3,), np.float64), gym.spaces.Box(-1, 1, (1,))
     made = 0
