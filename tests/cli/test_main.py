@@ -116,6 +116,11 @@ def fail(capsys: pytest.CaptureFixture[str], *words: str) -> str:
     return error
 
 
+@pytest.mark.fault(
+    kind=29,
+    injected="`pgkit eval` of a run of a recipe file",
+    outcome="it runs that file only with `--trust`",
+)
 def test_eval_runs_a_recipe_file_only_where_it_is_trusted(inside: Path, capsys: pytest.CaptureFixture[str], caplog):
     words = ["eval", "r", "--episodes", "3", "--which", "latest"]
     assert f"r is a run of {inside / 'walk.py'}, which would be run: --trust" in fail(capsys, *words)
@@ -301,6 +306,11 @@ def test_a_reader_that_goes_away_is_no_error(trained: Path):
     assert ls.returncode == 141
 
 
+@pytest.mark.fault(
+    kind=2,
+    injected="a recipe whose training diverges",
+    outcome="exit code 3, one line",
+)
 def test_a_diverged_run_exits_with_3(tmp_path: Path):
     (tmp_path / "walk.py").write_text(RECIPE.replace("log.step(frames)", "log.step(frames, None, {'x': float('nan')})"))
     done = pgkit("run", "walk.py", "--run-dir", "r", "--total-frames", "20", cwd=tmp_path)
