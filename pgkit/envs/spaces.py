@@ -66,6 +66,8 @@ def observation_entries(space: gym.Space, flatten: bool = True) -> list[Entry]:
     if isinstance(space, spaces.Box):
         image = space.dtype == np.uint8 and len(space.shape) > 1
         return [_box("observation", space, np.uint8 if image else np.float32, itself)]
+    if isinstance(space, spaces.Text):  # by itself
+        return [Entry("observation", (spaces.flatdim(space),), np.float32, partial(spaces.flatten, space), None)]
     return [_flat("observation", space, itself, apart="envs.make(..., flatten=False) keeps it apart")]
 
 
