@@ -40,7 +40,7 @@ def leaves(space: gym.Space, path: Path = ()) -> Iterator[tuple[Path, gym.Space]
         yield path, space
 
 
-def reader(space: gym.Space) -> Callable[[Any], np.ndarray] | None:
+def reader(space: gym.Space) -> Callable[[Any], Any] | None:
     """From what an environment returns for this space to its numbers, one vector; None where it holds none."""
     if isinstance(space, spaces.Box | spaces.MultiBinary):
         return partial(_flat, space.shape)
@@ -84,7 +84,7 @@ class Joined:
 
     def all(self, obs: Any) -> np.ndarray:
         """``[N, size]`` of a batch of observations; of arrays only."""
-        found = [(np.asarray(_at(obs, path)), space.shape) for path, space in self._spaces]
+        found = [(np.asarray(_at(obs, path)), space.shape or ()) for path, space in self._spaces]
         rows = len(found[0][0])
         return np.concatenate([numbers(x, (rows, *shape)).reshape(rows, prod(shape)) for x, shape in found], 1)
 

@@ -70,7 +70,8 @@ def _check_bounds(spec: Any) -> None:
     advice = "use modules.gaussian_actor, or bound the Box"
     if not isinstance(spec, Bounded):
         raise UserError(f"the action space has no bounds to squash into: {advice}")
-    for i, (low, high) in enumerate(zip(spec.space.low.tolist(), spec.space.high.tolist(), strict=True)):
+    space: Any = spec.space
+    for i, (low, high) in enumerate(zip(space.low.tolist(), space.high.tolist(), strict=True)):
         if not low < high:
             raise UserError(
                 f"action {i} is bounded to [{low:g}, {high:g}], which leaves no choice: take it out of the action space"

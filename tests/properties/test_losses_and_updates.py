@@ -98,8 +98,7 @@ def rollout() -> TensorDict:
 
 def update_of(size: int | None, accumulate: int, epochs: int, optimizer: Any = torch.optim.SGD) -> Any:
     loss, params = made("ClipPPOLoss", torch.float32)
-    advantage = advantages.GAE(loss_critic := modules.state_value(pendulum(), (6,)), gamma=0.9)
-    torch.nn.init.zeros_(loss_critic.get_submodule("module")[-1].weight)
+    advantage = advantages.GAE(modules.state_value(pendulum(), (6,)), gamma=0.9)
     return updates.OnPolicyUpdate(
         loss, advantage, optimizer(params, 1e-2), epochs=epochs, minibatch_size=size, accumulate=accumulate,
         compile="off", seed=0,

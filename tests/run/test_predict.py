@@ -91,7 +91,8 @@ def test_a_memory_and_which_rows_begin_an_episode():
             if starts[t, row]:
                 fresh.reset()
             fresh.predict(obs[t, row])
-            torch.testing.assert_close(fresh._acting.state[0], states[t][row])
+            state: Any = fresh._acting.state
+            torch.testing.assert_close(state[0], states[t][row])
     with pytest.raises(UserError, match=r"predict got 2 observations after 1.*call reset\(\), or give episode_start="):
         fresh.predict(obs[0, :2])
     with pytest.raises(UserError, match="predict got 3 flags of episode_start for 2 observations: one each"):
