@@ -94,7 +94,7 @@ def misshapen(env: Any, method: str, error: Exception, agent: str = "") -> UserE
 
 
 def _name(env: Any) -> str:
-    return type(getattr(env, "unwrapped", env)).__name__
+    return type(env.unwrapped if isinstance(env, gym.Env) else env).__name__
 
 
 def _kind(result: Any) -> str:

@@ -11,6 +11,7 @@ import warnings
 from typing import Any
 
 import gymnasium as gym
+from gymnasium.envs.registration import EnvSpec
 
 from pgkit.envs.atari import make_atari
 from pgkit.envs.rendering import PACKAGES, choose_backend
@@ -57,6 +58,17 @@ def make_one(env_id: str, **kwargs: Any) -> Any:
             f"environment '{env_id}' cannot be made with these settings: {reason}; --env.KEYWORD VALUE (envs.make(..., "
             "keyword=value)) gives one"
         ) from error
+
+
+def changed(spec: EnvSpec) -> dict[str, Any]:
+    """The keywords with which ``gymnasium.make(spec.id, ...)`` gives what ``spec`` says."""
+    known = gym.registry.get(spec.id)
+    if known is None or spec.additional_wrappers or spec.entry_point != known.entry_point:
+        raise UserError(
+            f"the EnvSpec of '{spec.id}' is not the registered one: give envs.make a function, lambda: spec.make()"
+        )
+    limit = {} if spec.max_episode_steps == known.max_episode_steps else {"max_episode_steps": spec.max_episode_steps}
+    return {**limit, **spec.kwargs}
 
 
 def _make_mpe2(env_id: str, max_episode_steps: int | None = None, **kwargs: Any) -> Any:

@@ -12,30 +12,23 @@ import gymnasium as gym
 import torch
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import VectorEnv as GymVectorEnv
-from gymnasium.vector import VectorWrapper
-from gymnasium.wrappers import vector as vector_wrappers
-from torchrl.envs import Compose, EnvBase, TransformedEnv, VecNorm, VecNormV2
+from torchrl.envs import EnvBase
 
 from pgkit.envs.action_repeat import ActionRepeat
 from pgkit.envs.agents import Names
 from pgkit.envs.gym_list import Gymnasium
 from pgkit.envs.gym_vector import GymnasiumVector
-from pgkit.envs.ids import is_atari, make_one, rendered
+from pgkit.envs.ids import changed, is_atari, make_one, rendered
 from pgkit.envs.numpy_entries import Info
-from pgkit.envs.once import warn_once
 from pgkit.envs.parallel import Parallel, is_parallel, refuse_turns
 from pgkit.envs.pixels import FrameStack, Pixels
 from pgkit.envs.seeding import episode_seed
+from pgkit.envs.statistics import warn_of_statistics
 from pgkit.envs.torch_batch import Torch
 from pgkit.envs.vector import VectorEnv
 from pgkit.envs.vmas_batch import Vmas
 from pgkit.errors import UserError, check_whole_number
 from pgkit.seams import Simulator
-
-_STATISTICS = (
-    gym.wrappers.NormalizeObservation, gym.wrappers.NormalizeReward, vector_wrappers.NormalizeObservation,
-    vector_wrappers.NormalizeReward,
-)  # fmt: skip
 
 
 class Settings(NamedTuple):
@@ -130,7 +123,7 @@ def make(
             "choose 1 <= workers <= num_envs"
         )
     if isinstance(env_id, EnvSpec):
-        env_id, kwargs = env_id.id, {**_changed(env_id), **kwargs}
+        env_id, kwargs = env_id.id, {**changed(env_id), **kwargs}
     limited = isinstance(env_id, str) and not env_id.startswith(("dm_control/", "dmc:"))  # by Gymnasium
     if limited and max_episode_steps is not None:
         kwargs["max_episode_steps"] = max_episode_steps
@@ -215,7 +208,7 @@ def _share(function: Callable[..., Any], settings: Settings, first: int, count: 
         return Parallel([made, *rest], seed, first, settings.groups, settings.reseed, settings.reset_options)
     if settings.groups is not None:
         raise UserError(f"groups= is for environments with many agents, {type(made).__name__} has one: leave it out")
-    _warn_of_statistics(made)
+    warn_of_statistics(made)
     envs, resets = [_one(env, settings) for env in (made, *rest)], (settings.reseed, settings.reset_options)
     return Gymnasium(envs, seed, first, settings.flatten, settings.info, settings.reward_clipping, *resets)
 
@@ -260,41 +253,11 @@ def _simulator(env: EnvBase | GymVectorEnv, seed: int, first: int, settings: Set
         )
     if not settings.reseed:
         raise UserError(f"reseed=False: {type(env).__name__} is seeded once anyway: leave it out")
-    _warn_of_statistics(env)
+    warn_of_statistics(env)
     if isinstance(env, GymVectorEnv):
         return GymnasiumVector(env, seed, first, settings.flatten, settings.info, settings.reset_options)
     env = env if settings.device is None else env.to(settings.device)
     return Torch(env, seed, first, settings.info)
-
-
-def _warn_of_statistics(env: Any) -> None:
-    """Says that a wrapper's statistics are its own: a resume and an evaluation begin with none."""
-    while isinstance(env, gym.Wrapper | VectorWrapper):
-        if isinstance(env, _STATISTICS):
-            _say_statistics(env)
-        env = env.env
-    if isinstance(env, TransformedEnv):
-        for transform in env.transform if isinstance(env.transform, Compose) else [env.transform]:
-            if isinstance(transform, VecNorm | VecNormV2):
-                _say_statistics(transform)
-
-
-def _say_statistics(owner: Any) -> None:
-    warn_once(
-        f"{type(owner).__name__} keeps statistics that evaluation and a resume begin anew: use --normalize-obs "
-        "(modules.ObsNormalizer) and --scale-returns, which are part of the checkpoint"
-    )
-
-
-def _changed(spec: EnvSpec) -> dict[str, Any]:
-    """The keywords with which ``gymnasium.make(spec.id, ...)`` gives what ``spec`` says."""
-    known = gym.registry.get(spec.id)
-    if known is None or spec.additional_wrappers or spec.entry_point != known.entry_point:
-        raise UserError(
-            f"the EnvSpec of '{spec.id}' is not the registered one: give envs.make a function, lambda: spec.make()"
-        )
-    limit = {} if spec.max_episode_steps == known.max_episode_steps else {"max_episode_steps": spec.max_episode_steps}
-    return {**limit, **spec.kwargs}
 
 
 def _one(env: Any, settings: Settings) -> gym.Env:
