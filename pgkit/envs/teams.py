@@ -1,4 +1,4 @@
-"""What a group of agents observes, gains and ends with, in every environment: arrays, and tensors of the same memory."""
+"""What a group of agents observes, gains and ends with: arrays, and tensors of the same memory."""
 
 from __future__ import annotations
 
