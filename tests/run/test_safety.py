@@ -1,5 +1,6 @@
 """Files of a run directory: no code in them runs, damage is found, and nothing of anyone else's is touched."""
 
+import contextlib
 import errno
 import hashlib
 import io
@@ -8,7 +9,9 @@ import os
 import pickle
 import random
 import re
+import resource
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -406,3 +409,30 @@ def test_an_agent_is_loaded_whole_and_trained_on(kit: SimpleNamespace, tmp_path:
         assert torch.equal(fresh.critic.weight, agent.critic.weight)
     with pytest.raises(UserError, match=r"state of agent does not fit .*it holds actor, critic; this agent has actor"):
         run.load_agent(tmp_path / "r", agent=kit.agent)
+
+
+@contextlib.contextmanager
+def limited(kind: int, most: int) -> Iterator[None]:
+    """What ``ulimit`` does to a process."""
+    soft, hard = resource.getrlimit(kind)
+    resource.setrlimit(kind, (most, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(kind, (soft, hard))
+
+
+@pytest.mark.fault(
+    kind=20,
+    injected="`ulimit -f`: files of 2 kB at most, and none at all; a file where the run directory's parent should be",
+    outcome="one line that says what cannot be written and why; no half file stays",
+)
+def test_limits_of_the_system_are_one_line(kit: SimpleNamespace, tmp_path: Path):
+    for most in (2000, 0):
+        with limited(resource.RLIMIT_FSIZE, most), pytest.raises(UserError, match="cannot be written: File too large"):
+            kit.train(arguments(kit, tmp_path / str(most)))
+        assert not [path for path in tmp_path.rglob("*") if path.name.endswith(".part")]
+    (tmp_path / "file").write_text("")
+    for path in (tmp_path / "file" / "r", tmp_path / "file"):
+        with pytest.raises(UserError, match="file"):
+            kit.train(arguments(kit, path))
