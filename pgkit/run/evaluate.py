@@ -3,7 +3,7 @@
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from logging import getLogger
+from logging import WARNING, getLogger
 from typing import Any
 
 import numpy as np
@@ -23,6 +23,18 @@ from pgkit.seams import Entries, Key
 
 RECORDED_AT, MOST_RECORDS = 20, 8  # calls of one layout before it is recorded, which takes 0.1 s; layouts
 LONG_EPISODE = 100_000  # steps; longer than those of Gymnasium, dm_control and Atari
+
+
+@contextmanager
+def _without_infos() -> Iterator[None]:
+    """What can be recorded is said where the policy is trained."""
+    log = getLogger("pgkit")
+    level = log.level
+    log.setLevel(WARNING)
+    try:
+        yield
+    finally:
+        log.setLevel(level)
 
 
 @contextmanager
@@ -84,7 +96,7 @@ class Acting:
         if self._calls[which] < RECORDED_AT or len(self._recorded) == MOST_RECORDS:
             return act
         self._constants = self._constants or Constants({"the policy": self.policy}, but={"training"})
-        with torch.no_grad(), torch.random.fork_rng():
+        with torch.no_grad(), torch.random.fork_rng(), _without_infos():
             self._recorded[which] = trace(act, list(inputs.values()), self.policy)
         return self._recorded[which]
 
