@@ -211,7 +211,7 @@ def test_names_of_files(here: Path):
 
 @pytest.mark.fault(
     kind=31,
-    injected="`pgkit ... | head`, a terminal that knows ASCII only",
+    injected="a reader that goes away (`head`), a terminal that knows ASCII only",
     outcome="no traceback; signs that the terminal lacks become `?`",
 )
 def test_pipes_and_terminals(here: Path):

@@ -28,7 +28,8 @@ def made(name: str, dtype: torch.dtype = torch.float64) -> Any:
     """A loss, and its networks."""
     torch.manual_seed(0)
     actor, critic = modules.gaussian_actor(pendulum(), (6,)), modules.state_value(pendulum(), (6,))
-    return getattr(losses, name)(actor.to(dtype), critic.to(dtype)), [*actor.parameters(), *critic.parameters()]
+    actor, critic = actor.to(dtype), critic.to(dtype)
+    return getattr(losses, name)(actor, critic), [*actor.parameters(), *critic.parameters()], critic
 
 
 def batch_of(loss: Any, rows: int, seed: int, dtype: torch.dtype = torch.float64) -> TensorDict:
@@ -58,7 +59,7 @@ def close(one: list[torch.Tensor], other: list[torch.Tensor], tolerance: float =
 @settings(max_examples=30)
 @given(POLICY_LOSSES, st.integers(2, 9), SEEDS)
 def test_rows_have_no_order_and_padding_does_not_count(name: str, rows: int, seed: int):
-    loss, params = made(name)
+    loss, params, _ = made(name)
     batch = batch_of(loss, rows, seed)
     before, expected = batch.clone(), gradients(loss, params, batch.clone())
     loss(batch)
@@ -69,7 +70,7 @@ def test_rows_have_no_order_and_padding_does_not_count(name: str, rows: int, see
     padded = torch.cat([batch, batch_of(loss, 3, seed + 1)])
     padded["advantage"][rows:] = padded["value_target"][rows:] = float("nan")
     padded["collector", "mask"] = torch.arange(rows + 3) < rows
-    masked, params = made(name)
+    masked, params, _ = made(name)
     close(gradients(masked, params, padded), expected)
 
 
@@ -77,8 +78,8 @@ def test_rows_have_no_order_and_padding_does_not_count(name: str, rows: int, see
 @given(POLICY_LOSSES, st.integers(1, 9), SEEDS)
 def test_single_precision_agrees_with_double(name: str, rows: int, seed: int):
     double, single = made(name), made(name, torch.float32)
-    expected = gradients(*double, batch_of(double[0], rows, seed))
-    close(gradients(*single, batch_of(single[0], rows, seed, torch.float32)), expected, 2e-3)
+    expected = gradients(*double[:2], batch_of(double[0], rows, seed))
+    close(gradients(*single[:2], batch_of(single[0], rows, seed, torch.float32)), expected, 2e-3)
 
 
 @given(st.integers(1, 50), st.integers(1, 60), st.integers(1, 5), SEEDS)
@@ -97,8 +98,8 @@ def rollout() -> TensorDict:
 
 
 def update_of(size: int | None, accumulate: int, epochs: int, optimizer: Any = torch.optim.SGD) -> Any:
-    loss, params = made("ClipPPOLoss", torch.float32)
-    advantage = advantages.GAE(modules.state_value(pendulum(), (6,)), gamma=0.9)
+    loss, params, critic = made("ClipPPOLoss", torch.float32)
+    advantage = advantages.GAE(critic, gamma=0.9)
     return updates.OnPolicyUpdate(
         loss, advantage, optimizer(params, 1e-2), epochs=epochs, minibatch_size=size, accumulate=accumulate,
         compile="off", seed=0,
@@ -187,7 +188,7 @@ def test_a_replay_holds_the_last_frames_and_comes_back(capacity: int, lengths: l
     assert len(buffer) <= 2 * count and len(buffer) >= 2 * min(ready, capacity - n_steps)
     if len(buffer):
         again.load_state_dict(buffer.state_dict())
-        for batch in (buffer.sample(64, 0.5), again.sample(64, 0.5)):
+        for batch in (x.sample(min(64, len(buffer)), 0.5) for x in (buffer, again)):
             first = batch["observation"][:, 0]
             assert first.min() >= count - capacity - 1 and first.max() < count - (n_steps - 1)
             torch.testing.assert_close(batch["next", "observation"][:, 0], first + n_steps)

@@ -50,8 +50,8 @@ def loop(data: dict[str, torch.Tensor], gamma: float, lmbda: float) -> torch.Ten
     value, following, reward, done, terminated = data.values()
     advantage, after = torch.zeros_like(value), torch.zeros_like(value[:, 0])
     for t in reversed(range(value.shape[1])):
-        delta = reward[:, t] + gamma * following[:, t] * ~terminated[:, t] - value[:, t]
-        after = delta + gamma * lmbda * ~done[:, t] * after
+        delta = reward[:, t] + gamma * following[:, t] * (~terminated[:, t]).double() - value[:, t]
+        after = delta + gamma * lmbda * (~done[:, t]).double() * after
         advantage[:, t] = after
     return advantage
 
@@ -100,7 +100,7 @@ def test_returns_agree_with_each_other(data: Any, gamma: float, lmbda: float):
     target = generalized_advantage(**linked, gamma=gamma, lmbda=lmbda)[1]
     ends["next_value"] = linked["next_value"]
     torch.testing.assert_close(lambda_return(**ends, gamma=gamma, lmbda=lmbda), target, rtol=1e-8, atol=1e-8)
-    one_step = data["reward"] + gamma * ends["next_value"] * ~data["terminated"]
+    one_step = data["reward"] + gamma * ends["next_value"] * (~data["terminated"]).double()
     torch.testing.assert_close(lambda_return(**ends, gamma=gamma, lmbda=0.0), one_step)
     torch.testing.assert_close(n_step_return(**ends, gamma=gamma, steps=1), one_step)
     on_policy = on_policy_vtrace(**linked, gamma=gamma, lmbda=lmbda)[1]
