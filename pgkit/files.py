@@ -17,11 +17,8 @@ from tensordict import TensorDict, TensorDictBase
 from pgkit.errors import UserError
 
 _MARK = b"pgkit-sha256"  # at the end of a file, before the 32 bytes of its hash
-_NUMPY, _TENSORDICT, _BYTES = (
-    "<numpy>",
-    "<tensordict>",
-    "<bytes>",
-)  # what torch's safe loading does not take; tensors stand for them
+# what torch's safe loading does not take; tensors stand for them
+_NUMPY, _TENSORDICT, _BYTES = "<numpy>", "<tensordict>", "<bytes>"
 _PLAIN = (torch.Tensor, torch.Size, torch.device, torch.dtype, str, bool, int, float, type(None))
 
 
