@@ -69,7 +69,7 @@ def parser() -> Parser:
 def positive(text: str) -> int:
     """A whole number from 1 to a million."""
     if not 1 <= (value := int(text)) <= 10**6:
-        raise argparse.ArgumentTypeError(f"{text:.30}: give a number from 1 to 1,000,000")
+        raise argparse.ArgumentTypeError(f"{text:.30} is not a positive number up to 1,000,000")
     return value
 
 

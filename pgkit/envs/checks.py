@@ -44,7 +44,7 @@ def checked_reset(env: gym.Env, seed: int | None, options: dict[str, Any] | None
         if not any(name in str(error) for name in given):
             raise
         raise UserError(
-            f"{_name(env)}.reset does not take {' and '.join(given)}: write reset(self, *, seed=None, options=None) "
+            f"{_name(env)}.reset takes no {' or no '.join(given)}: write reset(self, *, seed=None, options=None) "
             "and super().reset(seed=seed)"
         ) from error
     if not (isinstance(result, tuple) and len(result) == 2 and isinstance(result[1], dict)):

@@ -176,7 +176,7 @@ def _function(env_id: Any, kwargs: dict[str, Any]) -> Callable[..., Any]:
         return partial(make_one, env_id, **kwargs)
     if not callable(env_id) or isinstance(env_id, gym.Env):
         raise UserError(
-            "envs.make takes an id, an EnvSpec, a function or class that makes an environment, a gymnasium.vector."
+            "envs.make takes an id, a function or class that makes an environment, an EnvSpec, a gymnasium.vector."
             f"VectorEnv or a TorchRL EnvBase, this is a {type(env_id).__name__}: envs.make(lambda: ...)"
         )
     return partial(env_id, **kwargs)

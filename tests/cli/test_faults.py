@@ -31,7 +31,8 @@ class Mine(gym.Env):
         self.t += 1
         return self.observation_space.sample(), 1.0, self.t == 5, False, {"is_success": True}
 
-gym.register("Mine-v0", entry_point="mine:Mine")
+if "Mine-v0" not in gym.registry:
+    gym.register("Mine-v0", entry_point="mine:Mine")
 def none(env): pass
 def two(env, k): return env
 number = 3
@@ -198,7 +199,7 @@ def test_names_of_files(here: Path):
         ("eval", "r", "--seed", 2**63), ("export", "r", "-o", long), ("export", "r", "-o", f"{long}.pt2"),
         ("export", "r", "-o", "no/a.pt2"), ("export", "r", "-o", "a.xyz"), ("cp", "ppo", f"{long}.py"),
         ("cp", "ppo", "no/a.py"), ("cp", "nope", "a.py"), ("cp", "ppo", "a"), ("report", "nope.csv"), ("report", "."),
-        (*PPO, "--run-dir", long), (*PPO, "--run-dir", "mine.py"), (*PPO, "--run-dir", "r"), (*PPO, "--run-dir", "\0"),
+        (*PPO, "--run-dir", long), (*PPO, "--run-dir", "mine.py"), (*PPO, "--run-dir", "r"), 
         (*PPO, "--resume", long), (*PPO, "--init", long), (*PPO, "--resume-if-possible"), (), ("nope",), ("run",),
         ("experiment", "ppo", "--envs", "CartPole-v1", "--seeds", "1-99999999999999"),
         ("experiment", "ppo", "--envs", "CartPole-v1", "--seeds", "5-1"),

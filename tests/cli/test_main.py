@@ -177,7 +177,7 @@ def test_flags_reach_the_recipe(inside: Path, capsys: pytest.CaptureFixture[str]
         (["cp", "ppo", "x" * 300 + ".py"], "cannot be written: File name too long"),
         (["plot", "r", "-o", "x" * 300 + ".png"], "File name too long"),
         (["eval", "x" * 300], "is not a run directory"),
-        (["run", "ppo", "--env-id", "MiniGrid-Empty-5x5-v0"], "registers it: PACKAGE:MiniGrid-Empty-5x5-v0"),
+        (["run", "ppo", "--env-id", "MiniGrid-Empty-5x5-v0"], "registers it: minigrid:MiniGrid-Empty-5x5-v0"),
         (["run", "walk.py", "--threads", "1e6"], "--threads 1000000: give at most 256"),
         (["run", "walk.py", "--num-envs", str(2**63)], "--num-envs 9223372036854775808: give at most 1e+06"),
         (["run", "walk.py", "--resume-if-possible"], "--resume-if-possible needs a --run-dir"),

@@ -50,7 +50,7 @@ def test_a_failed_run_is_named_and_the_others_go_on(tmp_path, monkeypatch, capsy
         (["--envs", "CartPole-v1", "--seeds", "x"], "--seeds x: give numbers and ranges"),
         (["--envs", "CartPole-v1", "CartPole-v1"], "environment CartPole-v1 is given twice"),
         (["--envs", "CartPole-v1", "--seed=3"], "--seed: the experiment sets it"),
-        (["--envs", "CartPole-v1", "--jobs", "0"], "--jobs: 0: give a number from 1"),
+        (["--envs", "CartPole-v1", "--jobs", "0"], "--jobs: 0 is not a positive number"),
     ],
 )
 def test_words_that_make_no_experiment(words, message, capsys):

@@ -29,7 +29,9 @@ def made(name: str, dtype: torch.dtype = torch.float64) -> Any:
     torch.manual_seed(0)
     actor, critic = modules.gaussian_actor(pendulum(), (6,)), modules.state_value(pendulum(), (6,))
     actor, critic = actor.to(dtype), critic.to(dtype)
-    return getattr(losses, name)(actor, critic), [*actor.parameters(), *critic.parameters()], critic
+    loss = getattr(losses, name)(actor, critic)
+    loss.normalize_advantage = False  # by the deviation of n - 1 rows, it counts them
+    return loss, [*actor.parameters(), *critic.parameters()], critic
 
 
 def batch_of(loss: Any, rows: int, seed: int, dtype: torch.dtype = torch.float64) -> TensorDict:

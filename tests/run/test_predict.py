@@ -5,12 +5,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
 from torch import nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from pgkit import collectors, envs, modules, run
+from pgkit import envs, modules, run
 from pgkit.errors import UserError
-from pgkit.run import evaluate
+from pgkit.run.evaluate import RECORDED_AT
 
 
 def policy(memory: bool = False, **kwargs: Any) -> run.Policy:
@@ -29,13 +30,13 @@ def policy(memory: bool = False, **kwargs: Any) -> run.Policy:
 def test_predict_is_the_actor_bit_for_bit_recorded_or_not():
     one, draw = policy(), np.random.default_rng(0)
     actor: Any = one.actor
-    for call in range(3 * evaluate.RECORDED_AT):
-        if call == 2 * evaluate.RECORDED_AT:
+    for call in range(3 * RECORDED_AT):
+        if call == 2 * RECORDED_AT:
             with torch.no_grad():
                 actor.get_submodule("module.0.module")[-1].mean.bias.fill_(0.25)
         obs = draw.normal(size=(4, 3)).astype("f4")
         with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-            expected = actor(collectors.vector.TensorDict({"observation": torch.from_numpy(obs)}, [4]))["action"]
+            expected = actor(TensorDict({"observation": torch.from_numpy(obs)}, [4]))["action"]
         np.testing.assert_array_equal(one.predict(obs), expected.clamp(-2, 2).numpy())
         np.testing.assert_array_equal(one.predict(obs[0]).shape, (1,))
     assert len(one._acting._recorded) == 2
@@ -44,7 +45,7 @@ def test_predict_is_the_actor_bit_for_bit_recorded_or_not():
     torch.manual_seed(3)
     with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
         for got in drawn:
-            again = actor(collectors.vector.TensorDict({"observation": torch.from_numpy(obs)}, [4]))["action"]
+            again = actor(TensorDict({"observation": torch.from_numpy(obs)}, [4]))["action"]
             np.testing.assert_array_equal(got, again.clamp(-2, 2).numpy())
 
 
@@ -95,7 +96,7 @@ def test_a_memory_and_which_rows_begin_an_episode():
             torch.testing.assert_close(state[0], states[t][row])
     with pytest.raises(UserError, match=r"predict got 2 observations after 1.*call reset\(\), or give episode_start="):
         fresh.predict(obs[0, :2])
-    with pytest.raises(UserError, match="predict got 3 flags of episode_start for 2 observations: one each"):
+    with pytest.raises(UserError, match="predict got 3 flags of episode_start for 2 observations: one"):
         fresh.predict(obs[0, :2], episode_start=[True] * 3)
     assert fresh.predict(obs[0, :2], episode_start=[True, True]).shape == (2,)
     assert fresh.predict(obs[0, :2]).shape == (2,)
