@@ -115,7 +115,8 @@ def _flat(name: str, space: gym.Space, get: Callable[[Any], Any], apart: str) ->
 def _say_left_out(space: gym.Space, left_out: Sequence[Any], some_stay: bool) -> None:
     if not some_stay:
         raise UserError(
-            f"the observation space {space!s:.200} holds no numbers and cannot become one vector: encode it in a wrapper"
+            f"the observation space {space!s:.200} holds no numbers and cannot become one vector: "
+            "encode it in a wrapper"
         )
     for path in left_out:
         name = path if isinstance(path, str) else ".".join(map(str, path))

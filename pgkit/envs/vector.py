@@ -67,7 +67,8 @@ class VectorEnv(EnvBase):
         seed = kwargs.pop("seed", None)
         if given := [name for name, value in kwargs.items() if value is not None]:
             raise UserError(
-                f"reset({given[0]}=...): the environments take a seed only; for every reset: envs.make(..., reset_options=)"
+                f"reset({given[0]}=...): the environments take a seed only; for every reset: "
+                "envs.make(..., reset_options=)"
             )
         fresh = self.simulator.reset(seed, None if mask is None else mask.reshape(self.num_envs))
         return self._tensordict(fresh)
