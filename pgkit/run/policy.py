@@ -34,7 +34,7 @@ class Policy:
 
     def __post_init__(self) -> None:
         self._acting = Acting(self.actor, (self.action_key,))
-        self._begins, self._recurrent, self._reads = True, self.memory is not None, self.shapes
+        self._begins, self._recurrent = True, self.memory is not None
 
     @classmethod
     def of(cls, actor: torch.nn.Module, env: Any) -> Policy:
@@ -95,10 +95,10 @@ class Policy:
     def _entries(self, obs: Any) -> tuple[dict[Key, torch.Tensor], bool]:
         """What the actor reads as a batch, and whether it was a single observation."""
         given = obs if isinstance(obs, Mapping) else {"observation": obs}
-        entries, single = {}, False
-        for name, shape in self._reads.items():
+        entries, single, shapes = {}, False, self.shapes
+        for name, shape in shapes.items():
             if name not in given:
-                had, reads = (", ".join(map(dotted, keys)) for keys in (given, self._reads))
+                had, reads = (", ".join(map(dotted, keys)) for keys in (given, shapes))
                 raise UserError(f"predict got {had}; the policy takes the entries {reads}")
             x = np.asarray(given[name], dtype=self.dtype(name))
             single = x.shape == shape

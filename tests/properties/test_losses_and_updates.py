@@ -144,10 +144,9 @@ leaves = st.one_of(
     st.binary(max_size=9), SEEDS.map(lambda seed: torch.randn(2, 3, generator=torch.Generator().manual_seed(seed))),
     SEEDS.map(lambda seed: torch.arange(seed % 5).numpy()),
 )  # fmt: skip
-contents = st.recursive(
-    leaves,
-    lambda x: st.lists(x, max_size=3) | st.dictionaries(st.text(max_size=5), x, max_size=3) | st.tuples(x, x),
-    max_leaves=8,
+inner = leaves | st.lists(leaves, max_size=3) | st.dictionaries(st.text(max_size=5), leaves, max_size=3)
+contents = (
+    st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3) | st.tuples(inner, inner)
 )
 
 
