@@ -95,9 +95,9 @@ class Acting:
         self._calls[which] += 1
         if self._calls[which] < RECORDED_AT or len(self._recorded) == MOST_RECORDS:
             return act
-        self._constants = self._constants or Constants({"the policy": self.policy}, but={"training"})
         with torch.no_grad(), torch.random.fork_rng(), _without_infos():
             self._recorded[which] = trace(act, list(inputs.values()), self.policy)
+        self._constants = Constants({"the policy": self.policy}, but={"training"})
         return self._recorded[which]
 
     def _function(self, keys: list[Key], deterministic: bool) -> Act:
