@@ -5,8 +5,9 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
+import sys
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any, NoReturn
 
@@ -58,7 +59,12 @@ def save(path: Path, content: Any) -> None:
     plain = _encode(content, path.name)
     with replacing(path) as file:
         hashed = _Hashing(file)
-        torch.save(plain, hashed)
+        try:
+            torch.save(plain, hashed)
+        except RuntimeError:  # torch's writer has one of its own for a write that failed
+            if hashed.failed is None:
+                raise
+            raise hashed.failed from None
         file.write(_MARK + hashed.sha256.digest())
 
 
@@ -88,10 +94,15 @@ class _Hashing:
 
     def __init__(self, file: IO[bytes]) -> None:
         self.file, self.sha256 = file, hashlib.sha256()
+        self.failed: OSError | None = None
 
     def write(self, data: Any) -> int:
         self.sha256.update(data)
-        return self.file.write(data)
+        try:
+            return self.file.write(data)
+        except OSError as error:
+            self.failed = error
+            raise
 
     def flush(self) -> None:
         self.file.flush()
@@ -151,3 +162,18 @@ def _decode(x: Any) -> Any:
         items = [_decode(value) for value in x]
         return items if isinstance(x, list) else tuple(items)
     return x
+
+
+def shipped(function: Callable[..., Any]) -> bytes:
+    """A function for processes on other machines: with its whole module where that is no installed one."""
+    import cloudpickle
+
+    module = sys.modules[function.__module__]
+    own = module.__name__ != "__main__" and not module.__name__.startswith("pgkit.")
+    if not own:
+        return cloudpickle.dumps(function)
+    cloudpickle.register_pickle_by_value(module)
+    try:
+        return cloudpickle.dumps(function)
+    finally:
+        cloudpickle.unregister_pickle_by_value(module)

@@ -100,7 +100,10 @@ class Simulator(Protocol):
         ...
 
     def load_state_dict(self, state: dict[str, Any]) -> Entries:
-        """Goes on from :meth:`state_dict` as :attr:`resume` says; what the policy reads next."""
+        """Goes on from :meth:`state_dict` as :attr:`resume` says; what the policy reads next.
+
+        ``{"steps": n}`` stands for a state that is lost after ``n`` steps: episodes begin that none has had before.
+        """
         ...
 
     def close(self) -> None: ...

@@ -64,6 +64,16 @@ PRESETS = {
     "dmc:*": dict(),
 }  # fmt: skip
 
+SEARCH = {
+    "learning_rate": (1e-4, 3e-3, "log"),
+    "steps": [5, 8, 16, 32],
+    "lmbda": (0.9, 1.0),
+    "gamma": [0.98, 0.99, 0.995],
+    "entropy_coeff": [0.0, 1e-3, 1e-2],
+    "normalize_advantage": [False, True],
+    "log_std": (-2.0, 0.0),
+}
+
 
 def agent(args: Args, env: EnvBase) -> run.Agent:
     """Networks, loss and advantage."""

@@ -26,12 +26,12 @@ class Args(run.RunArgs):
     """Env steps to train for, all envs together; with action_repeat, decisions."""
     num_envs: int = 1
     """Envs stepped side by side."""
-    threads: int = 2
-    """Threads that PyTorch uses in this process; 2 is faster than 1 for networks 256 wide."""
+    threads: int = 0
+    """Threads that PyTorch uses in this process; 0: 1 or 2, whichever a measurement at the start finds faster."""
     steps: int = run.setting(1, low=1)
     """Steps each env takes between updates."""
-    asynchronous: bool = False
-    """Collect in another process while this one updates: rollouts are one update old, see train/policy_lag."""
+    overlap: bool = False
+    """Collect the next rollout in other processes while this one updates: its weights are one update old."""
     random_frames: int = run.setting(10_000, low=0)
     """Frames with random actions at the start; updates begin after them."""
     exploration_noise: float = run.setting(0.1, low=0)
@@ -74,6 +74,15 @@ PRESETS = {
     "dmc:*": dict(total_frames=500_000, action_repeat=2),
 }
 
+SEARCH = {
+    "learning_rate": (1e-4, 3e-3, "log"),
+    "q_learning_rate": (1e-4, 3e-3, "log"),
+    "batch_size": [128, 256, 512],
+    "exploration_noise": (0.05, 0.3),
+    "noise": ["gaussian", "ou"],
+    "tau": (0.002, 0.05, "log"),
+}
+
 
 def agent(args: Args, env: EnvBase) -> run.Agent:
     """Networks, loss and exploration."""
@@ -112,7 +121,7 @@ def main(args: Args) -> None:
             total_frames=args.total_frames,
             compile=args.compile,
         )
-        make_collector = collectors.AsyncCollector if args.asynchronous else collectors.VectorCollector
+        make_collector = collectors.AsyncCollector if args.overlap else collectors.VectorCollector
         collector = make_collector(
             env,
             built.explorer,
@@ -126,7 +135,7 @@ def main(args: Args) -> None:
         log.track(agent=built, eval_env=args.make_env, update=update, collector=collector, replay=replay)
         for rollout in collector:
             metrics = update(rollout)
-            if args.asynchronous:
+            if args.overlap:
                 metrics["policy_lag"] = collector.lag
             log.step(collector.frames, rollout, metrics, every=args.log_every)
         collector.shutdown()

@@ -27,12 +27,12 @@ class Args(run.RunArgs):
     """Env steps to train for, all envs together."""
     num_envs: int = 1
     """Envs stepped side by side."""
-    threads: int = 2
-    """Threads that PyTorch uses in this process; 2 is faster than 1 for networks 256 wide."""
+    threads: int = 0
+    """Threads that PyTorch uses in this process; 0: 1 or 2, whichever a measurement at the start finds faster."""
     steps: int = run.setting(1, low=1)
     """Steps each env takes between updates."""
-    asynchronous: bool = False
-    """Collect in another process while this one updates: rollouts are one update old, see train/policy_lag."""
+    overlap: bool = False
+    """Collect the next rollout in other processes while this one updates: its weights are one update old."""
     random_frames: int = run.setting(1_000, low=0)
     """Frames with random actions at the start; updates begin after them."""
     batch_size: int = run.setting(256, low=1)
@@ -88,6 +88,15 @@ PRESETS = {
         updates_per_step=0.25, buffer_size=300_000, hidden=(), target_entropy_weight=0.5,
     ),
 }  # fmt: skip
+
+SEARCH = {
+    "learning_rate": (1e-4, 3e-3, "log"),
+    "q_learning_rate": (1e-4, 3e-3, "log"),
+    "batch_size": [64, 128, 256],
+    "target_entropy_weight": (0.3, 0.98),
+    "tau": (0.002, 0.05, "log"),
+    "updates_per_step": [0.25, 0.5, 1.0],
+}
 
 
 def agent(args: Args, env: EnvBase) -> run.Agent:
@@ -148,7 +157,7 @@ def main(args: Args) -> None:
             total_frames=args.total_frames,
             compile=args.compile,
         )
-        make_collector = collectors.AsyncCollector if args.asynchronous else collectors.VectorCollector
+        make_collector = collectors.AsyncCollector if args.overlap else collectors.VectorCollector
         collector = make_collector(
             env,
             built.actor,
@@ -162,7 +171,7 @@ def main(args: Args) -> None:
         log.track(agent=built, eval_env=args.make_env, update=update, collector=collector, replay=replay)
         for rollout in collector:
             metrics = update(rollout)
-            if args.asynchronous:
+            if args.overlap:
                 metrics["policy_lag"] = collector.lag
             log.step(collector.frames, rollout, metrics, every=args.log_every)
         collector.shutdown()

@@ -73,6 +73,15 @@ PRESETS = {
     ),
 }  # fmt: skip
 
+SEARCH = {
+    "learning_rate": (1e-4, 3e-3, "log"),
+    "batch_size": [32, 64, 128],
+    "updates_per_step": [0.25, 0.5, 1.0],
+    "tau": (0.001, 0.05, "log"),
+    "n_step": (1, 5),
+    "epsilon_frames": [5_000, 20_000, 50_000],
+}
+
 
 def agent(args: Args, env: EnvBase) -> run.Agent:
     """Network, loss and exploration."""

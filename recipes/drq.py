@@ -82,6 +82,13 @@ PRESETS = {
     "dm_control/walker-*": dict(action_repeat=2, total_frames=50_000),
 }
 
+SEARCH = {
+    "learning_rate": (1e-4, 1e-3, "log"),
+    "batch_size": [64, 128, 256],
+    "tau": (0.005, 0.05, "log"),
+    "n_step": (1, 3),
+}
+
 
 def agent(args: Args, env: EnvBase) -> run.Agent:
     """Networks, temperature and loss: the critics' loss alone trains the convolutions."""

@@ -84,6 +84,11 @@ class Args(run.RunArgs):
             self.model, self.init = self.init, None
         self.env_id, self.num_envs = self.task, self.prompts
 
+    @property
+    def minibatch_size(self) -> int:
+        """Rows of a gradient step."""
+        return -(-self.prompts * self.group_size // self.minibatches)
+
     def make_env(self, num_envs: int, seed: int, workers: int = 1) -> Any:
         """Held-out prompts, for evaluation."""
         return self.prompt_env(500, seed, held_out=True)
@@ -118,7 +123,12 @@ def agent(args: Args, env: envs.Prompts) -> run.Agent:
     else:
         in_reward = args.kl_coeff if args.kl_in == "reward" else 0.0
         advantage = advantages.GroupRelative(
-            args.group_size, kind=args.advantage, drop=args.drop, kl_coeff=in_reward, kl=args.kl
+            args.group_size,
+            kind=args.advantage,
+            drop=args.drop,
+            multiple=args.minibatch_size,
+            kl_coeff=in_reward,
+            kl=args.kl,
         )
     return run.Agent(modules.TokenPolicy(actor, env.completion_length), loss, critic, advantage)
 
@@ -173,7 +183,7 @@ def main(args: Args) -> None:
             advantage=built.advantage,
             optimizer=torch.optim.Adam(built.parameters(), lr=args.learning_rate),
             epochs=args.epochs,
-            minibatch_size=-(-rows // args.minibatches),
+            minibatch_size=args.minibatch_size,
             max_grad_norm=args.max_grad_norm,
             total_frames=args.total_frames,
             compile=args.compile,

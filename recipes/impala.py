@@ -1,4 +1,4 @@
-"""IMPALA on one machine: worker processes with stale policies, one learner, V-trace; continuous and discrete actions.
+"""IMPALA: processes here or on Ray with stale policies, one learner, V-trace; continuous and discrete actions.
 
 The defaults are the MuJoCo settings; tuned values for other environments are in ``PRESETS`` below.
 """
@@ -11,11 +11,11 @@ from typing import Literal
 import torch
 from torchrl.envs import EnvBase
 
-from pgkit import advantages, collectors, controllers, losses, modules, run, updates
+from pgkit import advantages, controllers, losses, modules, run, updates
 
 
 @dataclass
-class Args(run.RunArgs):
+class Args(run.RayArgs):
     """Settings of IMPALA."""
 
     env_id: str = "HalfCheetah-v5"
@@ -76,6 +76,15 @@ PRESETS = {
     "dmc:*": dict(),
 }  # fmt: skip
 
+SEARCH = {
+    "learning_rate": (1e-4, 3e-3, "log"),
+    "steps": [16, 32, 64],
+    "lmbda": (0.9, 1.0),
+    "gamma": [0.98, 0.99, 0.995],
+    "entropy_coeff": [0.0, 1e-3, 1e-2],
+    "log_std": (-2.0, 0.0),
+}
+
 
 def agent(args: Args, env: EnvBase) -> run.Agent:
     """Networks, loss and advantage."""
@@ -101,7 +110,7 @@ def agent(args: Args, env: EnvBase) -> run.Agent:
 def main(args: Args) -> None:
     """Trains, logs, evaluates, saves."""
     with run.Run(args, recipe="impala") as log:
-        env = args.make_env(args.num_envs, args.seed, args.workers)
+        env = args.make_env(args.num_envs, args.seed, args.processes())
         with run.placed(args):
             built = agent(args, env)
         update = updates.OnPolicyUpdate(
@@ -115,15 +124,14 @@ def main(args: Args) -> None:
             total_frames=args.total_frames,
             compile=args.compile,
         )
-        collector = collectors.AsyncCollector(
+        collector = run.collector(
+            args,
             env,
             built.actor,
-            frames_per_batch=args.num_envs // args.workers * args.steps,
-            total_frames=args.total_frames,
-            per_worker=True,
+            frames_per_batch=args.num_envs // args.processes() * args.steps,
+            asynchronous=True,
             max_lag=args.max_lag,
             delay=args.delay,
-            compile=args.compile,
         )
 
         log.track(agent=built, eval_env=args.make_env, update=update, collector=collector)

@@ -6,7 +6,7 @@ A frame is one step of one environment, whatever the number of agents. ``pgkit r
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import torch
@@ -14,6 +14,7 @@ from tensordict.nn import TensorDictSequential
 from torch import nn
 
 from pgkit import advantages, collectors, controllers, envs, losses, modules, run, updates
+from pgkit.compiled import choose
 from pgkit.errors import UserError
 
 
@@ -97,6 +98,15 @@ PRESETS = {
     ),
 }  # fmt: skip
 
+SEARCH = {
+    "learning_rate": (5e-5, 2e-3, "log"),
+    "epochs": (5, 45),
+    "minibatch_size": [200, 400, 800],
+    "lmbda": (0.85, 0.98),
+    "entropy_coeff": [0.0, 1e-3, 1e-2],
+    "normalize_advantage": ["team", "agent", "minibatch"],
+}
+
 
 def group_agent(args: Args, env: envs.VectorEnv, group: str) -> run.Agent:
     """Networks, loss and advantage of one group."""
@@ -155,10 +165,16 @@ def agent(args: Args, env: envs.VectorEnv) -> run.Agent:
     return one
 
 
+def recorded(args: Args) -> Args:
+    """With ``--env.compile auto``, where that is not said and the run is long enough to win the time back."""
+    compile = choose(args.compile, args.total_frames / args.num_envs, least_calls=1_500)
+    return replace(args, env={"compile": "off" if compile == "off" else "auto"} | args.env)
+
+
 def main(args: Args) -> None:
     """Trains, logs, evaluates, saves."""
     with run.Run(args, recipe=args.variant or "mappo") as log:
-        env = args.make_env(args.num_envs, args.seed, args.workers)
+        env = recorded(args).make_env(args.num_envs, args.seed, args.workers)
         with run.placed(args):
             built = agent(args, env)
         update = updates.OnPolicyUpdate(

@@ -12,10 +12,11 @@ import torch
 from torchrl.envs import EnvBase
 
 from pgkit import advantages, collectors, controllers, losses, modules, run, updates
+from pgkit.errors import UserError
 
 
 @dataclass
-class Args(run.RunArgs):
+class Args(run.RayArgs):
     """Settings of PPO."""
 
     env_id: str = "HalfCheetah-v5"
@@ -68,6 +69,8 @@ class Args(run.RunArgs):
     """With a memory: steps of a sequence, which gradients flow through; minibatches are made of whole ones."""
     collector: Literal["pgkit", "torchrl"] = "pgkit"
     """pgkit's VectorCollector, or TorchRL's Collector: one process, and new episodes on a resume."""
+    overlap: bool = False
+    """Collect the next rollout in other processes while this one updates: its weights are one update old."""
 
 
 PRESETS = {
@@ -91,9 +94,24 @@ PRESETS = {
     ),
     "HalfCheetah-*": dict(lmbda=0.9),
     "Hopper-*": dict(learning_rate=2e-4, anneal=True),
+    "Swimmer-*": dict(gamma=0.9999),
     "dm_control/*": dict(),
     "dmc:*": dict(),
 }  # fmt: skip
+
+SEARCH = {
+    "learning_rate": (1e-4, 1e-3, "log"),
+    "anneal": [False, True],
+    "lmbda": (0.85, 0.98),
+    "gamma": [0.98, 0.99, 0.995, 0.999],
+    "steps": [128, 256, 512],
+    "minibatch_size": [32, 64, 128, 256],
+    "epochs": (5, 20),
+    "clip_epsilon": [0.1, 0.2, 0.3],
+    "entropy_coeff": [0.0, 1e-3, 1e-2],
+    "normalize_advantage": ["rollout", "minibatch", "off"],
+    "log_std": (-2.0, 0.0),
+}
 
 
 def agent(args: Args, env: EnvBase) -> run.Agent:
@@ -134,7 +152,7 @@ def agent(args: Args, env: EnvBase) -> run.Agent:
 def main(args: Args) -> None:
     """Trains, logs, evaluates, saves."""
     with run.Run(args, recipe="ppo") as log:
-        env = args.make_env(args.num_envs, args.seed, args.workers)
+        env = args.make_env(args.num_envs, args.seed, args.processes())
         with run.placed(args):
             built = agent(args, env)
         update = updates.OnPolicyUpdate(
@@ -151,15 +169,24 @@ def main(args: Args) -> None:
             total_frames=args.total_frames,
             compile=args.compile,
         )
-        sizes = {"frames_per_batch": args.num_envs * args.steps, "total_frames": args.total_frames}
+        if args.learners > 1:
+            collectors.connect(args.ray_address, args.processes() + args.learners)
+            update = updates.RayLearners(update, args.learners)
+        frames = args.num_envs * args.steps
         if args.collector == "pgkit":
-            collector = collectors.VectorCollector(env, built.actor, **sizes, compile=args.compile)
+            collector = run.collector(args, env, built.actor, frames_per_batch=frames, overlap=args.overlap)
+        elif args.overlap:
+            raise UserError("--overlap: TorchRL's Collector waits for the update; leave --collector at pgkit")
         else:
-            collector = collectors.TorchRLCollector(env, built.actor, **sizes)
+            collector = collectors.TorchRLCollector(
+                env, built.actor, frames_per_batch=frames, total_frames=args.total_frames
+            )
 
         log.track(agent=built, eval_env=args.make_env, update=update, collector=collector)
         for rollout in collector:
             metrics = update(rollout)
+            if args.overlap:
+                metrics["policy_lag"] = collector.lag
             if built.normalizer is not None:
                 built.normalizer.update(rollout["observation"])
             if built.scale is not None:

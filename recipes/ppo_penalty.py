@@ -76,6 +76,16 @@ PRESETS = {
     "dmc:*": dict(),
 }  # fmt: skip
 
+SEARCH = {
+    "learning_rate": (1e-4, 1e-3, "log"),
+    "lmbda": (0.85, 0.98),
+    "gamma": [0.98, 0.99, 0.995],
+    "minibatch_size": [64, 128, 256],
+    "epochs": (5, 20),
+    "kl_target": (0.003, 0.03, "log"),
+    "log_std": (-2.0, 0.0),
+}
+
 
 def agent(args: Args, env: EnvBase) -> run.Agent:
     """Networks, loss with its penalty, and advantage."""

@@ -80,6 +80,15 @@ PRESETS = {
     "dmc:*": dict(),
 }  # fmt: skip
 
+SEARCH = {
+    "learning_rate": (1e-4, 1e-3, "log"),
+    "old_rollouts": (0, 8),
+    "lmbda": (0.85, 1.0),
+    "minibatch_size": [64, 128, 256],
+    "epochs": (3, 10),
+    "log_std": (-2.0, 0.0),
+}
+
 
 def agent(args: Args, env: EnvBase) -> run.Agent:
     """Networks, loss and advantage."""

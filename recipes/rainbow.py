@@ -71,6 +71,15 @@ class Args(run.RunArgs):
 
 PRESETS = {"CartPole-*": dict(total_frames=100_000, eval_every=10_000, n_step=10)}
 
+SEARCH = {
+    "learning_rate": (1e-4, 3e-3, "log"),
+    "batch_size": [32, 64, 128],
+    "updates_per_step": [0.25, 0.5, 1.0],
+    "tau": (0.001, 0.05, "log"),
+    "n_step": (1, 10),
+    "priority_alpha": (0.3, 0.8),
+}
+
 
 class DuelingNoisyNet(nn.Module):
     """Log-probabilities of the return's atoms, by a value and an advantage stream: ``[*B, atoms, actions]``."""

@@ -58,6 +58,14 @@ PRESETS = {
     "dmc:*": dict(),
 }
 
+SEARCH = {
+    "learning_rate": (3e-4, 1e-2, "log"),
+    "steps": [128, 256, 512],
+    "gamma": [0.98, 0.99, 0.995],
+    "normalize_advantage": [False, True],
+    "log_std": (-2.0, 0.0),
+}
+
 
 def agent(args: Args, env: EnvBase) -> run.Agent:
     """Networks, loss and advantage."""

@@ -52,12 +52,12 @@ class Args(run.RunArgs):
     """Env steps to train for, all envs together; with action_repeat, decisions."""
     num_envs: int = 1
     """Envs stepped side by side."""
-    threads: int = 2
-    """Threads that PyTorch uses in this process; 2 is faster than 1 for networks 256 wide."""
+    threads: int = 0
+    """Threads that PyTorch uses in this process; 0: 1 or 2, whichever a measurement at the start finds faster."""
     steps: int = run.setting(16, low=1)
     """Steps each env takes before as many updates; 1 is the papers' schedule."""
-    asynchronous: bool = False
-    """Collect in another process while this one updates: rollouts are one update old, see train/policy_lag."""
+    overlap: bool = False
+    """Collect the next rollout in other processes while this one updates: its weights are one update old."""
     random_frames: int = run.setting(1_000, low=0)
     """Frames with random actions before updates begin; a run no longer than that has a batch of them."""
     batch_size: int = run.setting(256, low=1)
@@ -109,6 +109,16 @@ PRESETS = {
     "HalfCheetah-*": dict(learning_rate=1e-3, q_learning_rate=1e-3, alpha_learning_rate=1e-3),
     "dm_control/*": dict(total_frames=500_000, action_repeat=2),
     "dmc:*": dict(total_frames=500_000, action_repeat=2),
+}
+
+SEARCH = {
+    "learning_rate": (1e-4, 3e-3, "log"),
+    "q_learning_rate": (1e-4, 3e-3, "log"),
+    "batch_size": [128, 256, 512],
+    "tau": (0.002, 0.05, "log"),
+    "gamma": [0.98, 0.99, 0.995],
+    "critic": ["mlp", "layernorm", "crossq"],
+    "actor_delay": (1, 3),
 }
 
 VARIANTS = {
@@ -192,7 +202,7 @@ def main(args: Args) -> None:
             total_frames=args.total_frames,
             compile=args.compile,
         )
-        make_collector = collectors.AsyncCollector if args.asynchronous else collectors.VectorCollector
+        make_collector = collectors.AsyncCollector if args.overlap else collectors.VectorCollector
         collector = make_collector(
             env,
             built.actor,
@@ -208,7 +218,7 @@ def main(args: Args) -> None:
             if built.normalizer is not None:
                 built.normalizer.update(rollout["observation"])
             metrics = update(rollout)
-            if args.asynchronous:
+            if args.overlap:
                 metrics["policy_lag"] = collector.lag
             log.step(collector.frames, rollout, metrics, every=args.log_every)
         collector.shutdown()

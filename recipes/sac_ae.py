@@ -84,6 +84,13 @@ PRESETS = {
     "dm_control/walker-*": dict(action_repeat=2, total_frames=50_000),
 }
 
+SEARCH = {
+    "learning_rate": (1e-4, 1e-3, "log"),
+    "batch_size": [64, 128, 256],
+    "encoder_tau": (0.01, 0.1, "log"),
+    "latent_coeff": (1e-7, 1e-4, "log"),
+}
+
 
 def agent(args: Args, env: EnvBase) -> run.Agent:
     """Networks, temperature and losses: those of critics and reconstruction alone train the convolutions."""

@@ -70,6 +70,16 @@ PRESETS = {
     "dmc:*": dict(),
 }  # fmt: skip
 
+SEARCH = {
+    "max_kl": (0.003, 0.05, "log"),
+    "learning_rate": (3e-4, 3e-3, "log"),
+    "critic_epochs": (5, 30),
+    "steps": [128, 256, 512],
+    "lmbda": (0.85, 0.99),
+    "gamma": [0.98, 0.99, 0.995],
+    "log_std": (-2.0, 0.0),
+}
+
 
 def agent(args: Args, env: EnvBase) -> run.Agent:
     """Networks, loss and advantage."""

@@ -13,7 +13,8 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from pgkit.errors import UserError, within
-from pgkit.functional import listed, standardize
+from pgkit.functional import listed
+from pgkit.functional import standardize as over_all
 from pgkit.functional.modes import in_evaluation
 
 Keys = NestedKey | list[NestedKey]
@@ -82,6 +83,7 @@ class Advantage(TensorDictModuleBase):
                 "modules.state_value(env), or a TensorDictModule with out_keys=['state_value']"
             )
         self.critic, self.standardize, self.return_scale = critic, standardize, return_scale
+        self.standardizer = over_all  # of several learners, one over the rows of all
         self.per_agent = per_agent
         self._critic_value = (values or written or ["state_value"])[0]
         self.register_buffer("gamma", torch.tensor(float(gamma), dtype=torch.float64))
@@ -136,7 +138,7 @@ class Advantage(TensorDictModuleBase):
         values = ((x * scale).movedim(time, -2) for x in (value, next_value))
         advantage, target = (x.movedim(-2, time) for x in self.estimate(*values, rollout))
         if self.standardize:
-            advantage = standardize(advantage, self._mask(advantage, rollout), self._axes(advantage, time))
+            advantage = self.standardizer(advantage, self._mask(advantage, rollout), self._axes(advantage, time))
         rollout.set(keys.advantage, advantage)
         rollout.set(keys.value_target, target / scale)
         return rollout

@@ -32,8 +32,9 @@ class GroupRelative(Advantage):
         kind: ``group``: less the group's mean, over its deviation; ``mean``: without the deviation, Dr. GRPO's
             (https://arxiv.org/abs/2503.20783); ``leave_one_out``: less the mean of the others, RLOO's
             (https://arxiv.org/abs/2402.14740); ``batch``: less the group's mean, over the batch's deviation.
-        drop: token rows: groups whose rewards are all equal leave the batch (DAPO, https://arxiv.org/abs/2503.14476);
-            their mask becomes False and their log-probabilities 0.
+        drop: token rows: groups whose rewards are all equal leave the batch (DAPO, https://arxiv.org/abs/2503.14476).
+        multiple: with ``drop``, the rows left are a multiple of this, such as a minibatch, at least one: rows that left
+            fill up, with a mask of False and log-probabilities of 0. ``group_size`` by default.
         kl_coeff: token rows: subtract so much of the summed divergence from the reference off the reward.
         kl: its estimate, as in :func:`~pgkit.functional.kl_estimate`.
         divide: False is another name of ``kind="mean"``.
@@ -52,6 +53,7 @@ class GroupRelative(Advantage):
         *,
         kind: str = "group",
         drop: bool = False,
+        multiple: int | None = None,
         kl_coeff: float = 0.0,
         kl: str = "k1",
         divide: bool = True,
@@ -66,7 +68,7 @@ class GroupRelative(Advantage):
         if kind not in KINDS:
             raise UserError(f"kind={kind!r}: give {', '.join(KINDS)}")
         self.group_size, self.kind, self.drop = group_size, kind if divide or kind != "group" else "mean", drop
-        self.kl_coeff, self.kl = kl_coeff, kl
+        self.multiple, self.kl_coeff, self.kl = multiple or group_size, kl_coeff, kl
 
     def estimate(self, value: Tensor, next_value: Tensor, rollout: TensorDictBase) -> tuple[Tensor, Tensor]:
         reward, done, terminated = ends(rollout)
@@ -91,11 +93,17 @@ class GroupRelative(Advantage):
             divergence = kl_estimate(rollout[REFERENCE] - log_prob, self.kl)
             score = score - self.kl_coeff * torch.where(mask, divergence, 0.0).sum(1)
         advantage = KINDS[self.kind](score, self.group_size).unsqueeze(-1)
-        if self.drop:
-            mask = mask & has_spread(reward.squeeze(-1), self.group_size).unsqueeze(-1)
-            rollout.set(COMPLETION, mask).set(LOG_PROBS, torch.where(mask, log_prob, 0.0))
         rollout.set("advantage", (advantage * mask).unsqueeze(-1))
-        return rollout.set("value_target", (reward * mask).unsqueeze(-1))
+        rollout.set("value_target", (reward * mask).unsqueeze(-1))
+        return self._with_spread(rollout) if self.drop else rollout
+
+    def _with_spread(self, rollout: TensorDictBase) -> TensorDictBase:
+        """The rows of groups with spread, filled up to a multiple with rows whose mask is False."""
+        live = has_spread(rollout["next", "reward"].squeeze(-1), self.group_size)
+        mask = rollout[COMPLETION] & live.unsqueeze(-1)
+        rollout.set(COMPLETION, mask).set(LOG_PROBS, torch.where(mask, rollout[LOG_PROBS], 0.0))
+        count = max(1, -(-int(live.sum()) // self.multiple)) * self.multiple
+        return rollout[live.int().argsort(descending=True, stable=True)[:count]]
 
 
 KINDS = {

@@ -31,6 +31,7 @@ class TokenGAE(TensorDictModuleBase):
         super().__init__()
         within(0, 1, gamma=gamma, lmbda=lmbda)
         self.critic, self.gamma, self.lmbda = critic, gamma, lmbda
+        self.standardizer = standardize  # of several learners, one over the rows of all
         self.in_keys = [*critic.in_keys, COMPLETION, ("next", "reward")]
         self.out_keys = ["advantage", "value_target", "state_value"]
 
@@ -43,6 +44,6 @@ class TokenGAE(TensorDictModuleBase):
         reward = rollout["next", "reward"].unsqueeze(-1) * last
         following = torch.cat([value[:, 1:], torch.zeros_like(value[:, :1])], 1)
         advantage, target = generalized_advantage(value, following, reward, last, last, self.gamma, self.lmbda)
-        rollout.set("advantage", standardize(advantage, mask) * mask)
+        rollout.set("advantage", self.standardizer(advantage, mask) * mask)
         rollout.set("value_target", target * mask)
         return rollout.set("state_value", value)

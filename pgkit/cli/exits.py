@@ -6,15 +6,10 @@ import contextlib
 import io
 import os
 import sys
-import traceback
 from collections.abc import Iterator
-from pathlib import Path
 from types import TracebackType
 
-from pgkit.errors import Diverged, UserError
-
-PGKIT = str(Path(__file__).parents[1])
-OTHERS = tuple(path for path in sys.path if path.endswith("-packages"))
+from pgkit.errors import Diverged, EnvironmentFailed, UserError, frames_of
 
 
 @contextlib.contextmanager
@@ -41,10 +36,8 @@ def exits() -> Iterator[None]:
 
 def report(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
     """Prints an exception as one line, and below it where in the user's own code it was raised, or else everything."""
-    frames = traceback.extract_tb(trace)
-    pgkit = [number for number, frame in enumerate(frames) if frame.filename.startswith(PGKIT)]
-    own = [frame for frame in frames if frame.line and not frame.filename.startswith((PGKIT, *OTHERS, "<frozen"))]
-    raised_there = own and (not pgkit or frames.index(own[-1]) > pgkit[-1])
+    if isinstance(error, EnvironmentFailed):
+        print(f"error: {error.line}\n{error.frames}", end="", file=sys.stderr)
+        return
     text = " ".join(str(error).split()) or "no message"
-    print(f"error: {kind.__name__}: {text}", file=sys.stderr)
-    print("".join(traceback.format_list(own if raised_there else frames)), end="", file=sys.stderr)
+    print(f"error: {kind.__name__}: {text}\n{frames_of(trace)}", end="", file=sys.stderr)

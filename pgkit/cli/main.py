@@ -1,6 +1,7 @@
 """``pgkit ls / cp / run / eval / export / plot``. Heavy imports wait until a command needs them."""
 
 import argparse
+import os
 import runpy
 import sys
 from collections.abc import Sequence
@@ -23,12 +24,22 @@ class Parser(argparse.ArgumentParser):
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Run one command: exit 2 and one line on a user's error, 3 on divergence, 130 on Ctrl-C."""
+    _wait_quietly()
     with exits():
         args, flags = parser().parse_known_args(argv)
         if flags and not args.takes_flags:
             raise UserError(f"unrecognized arguments: {' '.join(flags)} (see pgkit --help)")
         args.flags = flags or args.flags
         args.command(args)
+
+
+def _wait_quietly() -> None:
+    """Threads that wait for each other sleep: by default they spin, which starves a second run on the same cores.
+
+    OpenMP reads it when torch loads.
+    """
+    if not {"OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "KMP_BLOCKTIME"} & os.environ.keys():
+        os.environ["OMP_WAIT_POLICY"] = "passive"
 
 
 def parser() -> Parser:

@@ -32,6 +32,8 @@ def add(commands: Any, positive: Callable[[str], int]) -> None:
     command.add_argument("tables", type=Path, nargs="+", metavar="FILE.csv", help="tables that pgkit experiment wrote")
     command.add_argument("-o", "--out", type=Path, default=Path("report.md"), help="(default: report.md)")
     command.add_argument("--x", choices=["frames", "minutes"], default="frames", help="axis of the curves")
+    command.add_argument("--published", type=Path, metavar="FILE.csv", help="others' scores, to stand beside")
+    command.add_argument("--reach", type=float, nargs="+", default=[], metavar="SCORE", help="show the time to scores")
     command.set_defaults(command=write_report)
 
     command = commands.add_parser(
@@ -75,7 +77,8 @@ def write_report(args: argparse.Namespace) -> None:
 
     if args.out.suffix != ".md":
         raise UserError(f"--out {args.out}: give a name that ends in .md")
-    print(report(args.tables, args.out, args.x), end="")
+    text = report(args.tables, args.out, args.x, published=args.published, reach=args.reach)
+    print(text, end="")
     print(f"wrote {args.out}")
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Iterator
-from multiprocessing.connection import wait
 from typing import Any
 
 from tensordict import TensorDictBase
@@ -14,9 +13,9 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from pgkit.collectors.actor import Beside, example
-from pgkit.collectors.stepping import as_rollout
+from pgkit.collectors.stepping import as_rollout, lost
 from pgkit.collectors.vector import count, say_resume
-from pgkit.collectors.workers import Workers, check_splits, shares
+from pgkit.collectors.workers import MakePool, Pool, Workers, check_splits, shares
 from pgkit.compiled import choose
 from pgkit.envs import vector_of
 from pgkit.errors import UserError
@@ -45,6 +44,7 @@ class AsyncCollector:
             workers, they take turns and runs repeat themselves.
         delay: order with the weights of so many updates ago: forced lag, to study it.
         compile: ``on``, ``off`` or ``auto``, for the policy.
+        pool: makes the processes that collect.
 
     Raises:
         UserError: sizes that do not fit, environments that this process holds, or an actor that was built for another
@@ -63,6 +63,7 @@ class AsyncCollector:
         max_lag: int | None = None,
         delay: int = 0,
         compile: str = "auto",
+        pool: MakePool = Workers,
     ) -> None:
         env = vector_of(env)
         check_splits(env)
@@ -86,7 +87,7 @@ class AsyncCollector:
         calls = None if total_frames < 0 else total_frames / env.num_envs
         self._compile = choose(compile, calls, least_calls=50_000)
         self._outputs, self._beside = example(env, actor), Beside(actor, env)
-        self._groups: list[Workers] = []
+        self._make_pool, self._groups = pool, list[Pool]()
         self._updates = 0  # rollouts handed out: the caller makes one update with each
         self._orders = [0] * len(self._bounds)  # rollouts ordered, by group
         self._versions = [0] * len(self._bounds)  # the update whose weights a group collects with
@@ -99,6 +100,10 @@ class AsyncCollector:
 
     def rollout(self) -> TensorDictBase:
         """The next rollout, and an order for the one after it."""
+        if not all(workers.is_open for workers in self._groups):  # one has failed
+            state = self.state_dict()
+            self.shutdown()
+            self.load_state_dict(state)
         if not self._groups:
             self._start()
             for group in range(len(self._groups)):
@@ -114,25 +119,33 @@ class AsyncCollector:
         return self._beside.bring(rollout)
 
     def state_dict(self) -> dict[str, Any]:
-        """Counters, rollouts that are collected but not handed out yet, and every environment's state."""
+        """Counters, rollouts that are collected but not handed out yet, and every environment's state.
+
+        After a rollout that failed, the environments have none: they begin new episodes.
+        """
+        if not all(workers.is_open for workers in self._groups):
+            gone = [[lost(count * self._steps)] for count in self._orders]
+            return self._counters() | {"done": [None] * len(gone), "envs": gone}
         for group, workers in enumerate(self._groups):
             self._done[group] = self._done[group] or workers.finish()
+        done = [arrays and dict(arrays) for arrays in self._done]
+        return self._counters() | {"done": done, "envs": [workers.state_dict() for workers in self._groups]}
+
+    def _counters(self) -> dict[str, Any]:
         return {
             "frames": self.frames,
             "updates": self._updates,
             "orders": list(self._orders),
             "versions": list(self._versions),
-            "done": [arrays and dict(arrays) for arrays in self._done],
             "past": [(version, [x.clone() for x in weights]) for version, weights in self._past],
-            "envs": [workers.state_dict() for workers in self._groups],
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restores :meth:`state_dict`, taken with the same workers."""
         self.frames, self._updates = state["frames"], state["updates"]
-        say_resume(self.env)
         if not state["envs"]:
             return
+        say_resume(self.env, state["envs"][0][0])
         if len(state["envs"]) != len(self._bounds):
             raise UserError(
                 f"the checkpoint has rollouts of {len(state['envs'])} workers, there are {len(self._bounds)} now: "
@@ -142,8 +155,10 @@ class AsyncCollector:
         self._done, self._past = list(state["done"]), deque(state["past"], maxlen=self.delay + 1)
         if not self._groups:
             self._start()
-        for workers, saved in zip(self._groups, state["envs"], strict=True):
+        for group, (workers, saved) in enumerate(zip(self._groups, state["envs"], strict=True)):
             workers.load_state_dict(saved)
+            if self._done[group] is None:  # its rollout failed
+                self._order(group)
 
     def shutdown(self) -> None:
         """Ends the worker processes and closes the environments."""
@@ -155,7 +170,7 @@ class AsyncCollector:
     def _start(self) -> None:
         start = time.perf_counter()
         settings = self.env, self._beside.actor, self._steps, self._outputs, self._compile
-        self._groups = [Workers(*settings, bounds) for bounds in self._bounds]
+        self._groups = [self._make_pool(*settings, bounds) for bounds in self._bounds]
         self.compile_seconds += time.perf_counter() - start
 
     def _order(self, group: int) -> None:
@@ -182,4 +197,5 @@ class AsyncCollector:
             for group in by_age:
                 if self._done[group] or self._groups[group].ready():
                     return group
-            wait([pipe for workers in self._groups for pipe in workers.pipes])
+            if not self._groups[0].wait_any(self._groups):
+                return by_age[0]  # whose time is watched

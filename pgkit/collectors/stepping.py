@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
 from typing import Any
@@ -13,6 +14,7 @@ from torch import Tensor
 
 from pgkit.collectors.actor import is_state, memory, path_of
 from pgkit.collectors.policy import RowPolicy, choices, function_of, padded_rows, random_actions
+from pgkit.collectors.rebuild import Past
 from pgkit.compiled import Mode
 from pgkit.envs import VectorEnv
 from pgkit.errors import UserError
@@ -70,7 +72,9 @@ class Share:
         self._actions = [key for key, _ in _specs(simulator.action_spec)]
         self._outputs = list(outputs)
         self._fresh: Entries | None = None
-        self._memory = memory(actor, simulator.num_envs, simulator.device)
+        self._amid: int | None = None  # the step at which a rollout began that is not finished
+        self._start = memory(actor, simulator.num_envs, simulator.device)
+        self._memory = self._start
         self._keys = [*self._observed, *self._memory]
         self._now, self._decided = _rows(buffers, self._keys), _rows(buffers, self._outputs)
         counted = buffers | {("next", "step_count"): buffers["next", "step_count"].squeeze(-1)}
@@ -100,8 +104,9 @@ class Share:
     def collect(self, step: int, random: bool = False) -> None:
         """Steps the environments through the buffers; ``step`` counts their steps since the beginning."""
         policy, simulator = self._random if random else self._policy, self.simulator
-        if self._fresh is None:
-            self._fresh = simulator.reset()
+        if self._fresh is None or self._amid is not None:  # an earlier rollout was broken off
+            self._fresh, self._memory = simulator.reset(), self._start
+        self._amid = step
         fresh, remembered, observed = self._fresh, self._memory, self._observed
         actions = [(key, self._outputs.index(key)) for key in self._actions]
         states = [at for at, key in enumerate(self._outputs) if is_state(key)]
@@ -125,17 +130,39 @@ class Share:
                     remembered |= {key: outputs[at] for key, at in zip(kept, states, strict=True)}
                 if self._mask is not None and made.mask is not None:
                     self._mask[t].copy_(made.mask)
-        self._fresh, self._memory = fresh, remembered
+        self._fresh, self._memory, self._amid = fresh, remembered, None
+
+    @torch.inference_mode()
+    def rebuild(self, past: Past) -> None:
+        """Goes on where another share was: from a state that it told, through the actions that it took since."""
+        if past.state is not None:
+            self.load_state_dict(pickle.loads(past.state))
+        elif self._fresh is None:
+            self._fresh = self.simulator.reset()
+        for actions in past.actions:
+            for now in zip(*(x.unbind(0) for x in actions.values()), strict=True):
+                made = self.simulator.step(dict(zip(actions, now, strict=True)))
+                self._fresh, begun = made.fresh, made.begun()
+        if past.actions and self._memory:
+            names = [key for key in self._memory if key != "is_init"]
+            self._memory = {"is_init": begun.unsqueeze(-1), **dict(zip(names, past.memory.values(), strict=True))}
 
     def state_dict(self) -> dict[str, Any]:
-        """The simulator's state, and the policy's memory."""
+        """The simulator's state, and the policy's memory; amid a rollout there is none to go on from."""
+        if self._amid is not None:
+            return lost(self._amid)
         return {"simulator": self.simulator.state_dict(), "memory": {k: x.clone() for k, x in self._memory.items()}}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Goes on from :meth:`state_dict`, as the simulator's ``resume`` says."""
-        self._fresh = self.simulator.load_state_dict(state["simulator"])
-        if self._memory and self.simulator.resume == "exact":
+        self._fresh, self._memory = self.simulator.load_state_dict(state["simulator"]), self._start
+        if state["memory"] and self.simulator.resume == "exact":
             self._memory = {key: x.to(self.simulator.device) for key, x in state["memory"].items()}
+
+
+def lost(steps: int) -> dict[str, Any]:
+    """Stands for the state of a share that is gone after so many steps: its environments begin new episodes."""
+    return {"simulator": {"steps": steps}, "memory": {}}
 
 
 def regroup(states: Sequence[dict[str, Any]], bounds: Sequence[int]) -> list[dict[str, Any]]:
@@ -148,6 +175,8 @@ def regroup(states: Sequence[dict[str, Any]], bounds: Sequence[int]) -> list[dic
     if "rows" not in simulators[0]:
         if len(states) == counts:
             return list(states)
+        if simulators[0].keys() == {"steps"}:  # they begin anew in any case
+            return [states[0]] * counts
         raise UserError(
             f"the checkpoint is of {len(states)} processes, there are {counts} now, and the states of these "
             "environments cannot be taken apart: resume with the same --workers"

@@ -12,8 +12,8 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from pgkit.collectors.actor import Beside, example
-from pgkit.collectors.stepping import MASK, Share, allocate, as_rollout, regroup
-from pgkit.collectors.workers import Workers, check_splits
+from pgkit.collectors.stepping import MASK, Share, allocate, as_rollout, lost, regroup
+from pgkit.collectors.workers import MakePool, Pool, Workers, check_splits
 from pgkit.compiled import Constants, choose
 from pgkit.envs import VectorEnv, vector_of
 from pgkit.errors import UserError, check_whole_number
@@ -43,6 +43,8 @@ class VectorCollector:
         init_random_frames: the rollouts that begin before so many frames draw actions uniformly from the action spec;
             their log-probability is NaN.
         compile: ``on``, ``off``, or ``auto``: where a C++ compiler is there and ``total_frames`` is large enough.
+        pool: makes the processes that collect; None: :class:`~pgkit.collectors.workers.Workers`, for ``env.workers``
+            above 1.
 
     Raises:
         UserError: sizes that do not fit, an actor that was built for another environment; while collecting,
@@ -58,9 +60,11 @@ class VectorCollector:
         total_frames: int = -1,
         init_random_frames: int = 0,
         compile: str = "auto",
+        pool: MakePool | None = None,
     ) -> None:
         env = vector_of(env)
-        if env.workers > 1:
+        self._pooled = env.workers > 1 or pool is not None
+        if self._pooled:
             check_splits(env)
         check_whole_number(1, frames_per_batch=frames_per_batch)
         if frames_per_batch % env.num_envs:
@@ -82,7 +86,8 @@ class VectorCollector:
         steps = None if total_frames < 0 else total_frames / env.num_envs
         self._compile = choose(compile, steps, least_calls=50_000)
         self._outputs, self._beside = example(env, actor), Beside(actor, env)
-        self._workers: Workers | None = None
+        self._make_pool: MakePool = pool or Workers
+        self._workers: Pool | None = None
         self._share: Share | None = None
         self._constants: Constants | None = None
 
@@ -93,12 +98,11 @@ class VectorCollector:
     def rollout(self) -> TensorDictBase:
         """Collects one rollout with the actor's present weights."""
         step, random = self._rollouts * self._steps, self.frames < self.init_random_frames
-        if self.env.workers > 1:
+        if self._pooled:
             self._pool().begin(self.actor.state_dict().values(), step, random)
             buffers = self._pool().finish()
         else:
-            share = self._alone()
-            share.collect(step, random)
+            self._alone().collect(step, random)
             buffers = {key: x.clone() for key, x in self._buffers.items()}
         rollout = as_rollout(buffers, self.env)
         self.frames += count(rollout)
@@ -106,15 +110,21 @@ class VectorCollector:
         return self._beside.bring(rollout)
 
     def state_dict(self) -> dict[str, Any]:
-        """Counters, and the state of every environment and of the policy's memory."""
-        shares = self._pool().state_dict() if self.env.workers > 1 else [self._alone().state_dict()]
+        """Counters, and the state of every environment and of the policy's memory.
+
+        After a rollout that failed, the environments have none: they begin new episodes.
+        """
+        if self._workers is not None and not self._workers.is_open:
+            shares = [lost(self._rollouts * self._steps)]
+        else:
+            shares = self._pool().state_dict() if self._pooled else [self._alone().state_dict()]
         return {"frames": self.frames, "rollouts": self._rollouts, "shares": shares}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restores :meth:`state_dict`, also one taken with another number of workers."""
         self.frames, self._rollouts = state["frames"], state["rollouts"]
-        say_resume(self.env)
-        if self.env.workers > 1:
+        say_resume(self.env, state["shares"][0])
+        if self._pooled:
             self._pool().load_state_dict(state["shares"])
         else:
             self._alone().load_state_dict(regroup(state["shares"], [0, self.env.num_envs])[0])
@@ -127,10 +137,12 @@ class VectorCollector:
         self.env.close_simulator()
         self._share = None
 
-    def _pool(self) -> Workers:
+    def _pool(self) -> Pool:
         """The workers; they get new weights only, and start again where something else in the actor was replaced."""
-        changed = self._constants.changed(memory=False) if self._workers and self._constants else None
         state = None
+        if self._workers is not None and not self._workers.is_open:  # one has failed
+            state, self._workers = [lost(self._rollouts * self._steps)], None
+        changed = self._constants.changed(memory=False) if self._workers and self._constants else None
         if self._workers is not None and changed:
             getLogger("pgkit").warning(
                 "the workers start again: in the actor %s (a buffer changed in place, by fill_, needs no such thing)",
@@ -141,11 +153,9 @@ class VectorCollector:
             self._workers = None
         if self._workers is None:
             start = time.perf_counter()
-            self._constants, self._beside = (
-                Constants({"the actor": self.actor}, but={"training"}),
-                Beside(self.actor, self.env),
-            )
-            self._workers = Workers(self.env, self._beside.actor, self._steps, self._outputs, self._compile)
+            self._constants = Constants({"the actor": self.actor}, but={"training"})
+            self._beside = Beside(self.actor, self.env)
+            self._workers = self._make_pool(self.env, self._beside.actor, self._steps, self._outputs, self._compile)
             self.compile_seconds += time.perf_counter() - start
             if state is not None:
                 self._workers.load_state_dict(state)
@@ -176,7 +186,11 @@ def count(rollout: TensorDictBase) -> int:
     return rollout.numel() if mask is None else int(mask.sum())
 
 
-def say_resume(env: VectorEnv) -> None:
+def say_resume(env: VectorEnv, share: dict[str, Any]) -> None:
     """The one line that says what a resume brings back."""
-    exact = "every environment goes on where it was" if env.resume == "exact" else "every environment begins anew"
-    getLogger("pgkit").info("the resumed run: %s (%s)", exact, env.env_id)
+    is_lost = share["simulator"].keys() == {"steps"}
+    exact = "every environment goes on where it was"
+    if is_lost or env.resume != "exact":
+        exact = "every environment begins anew"
+    why = ": the run before it ended in the middle of a rollout" if is_lost and env.resume == "exact" else ""
+    getLogger("pgkit").info("the resumed run: %s%s (%s)", exact, why, env.env_id)

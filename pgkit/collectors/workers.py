@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
-import signal
+import pickle
 import sys
-import traceback
-import weakref
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from itertools import pairwise
-from multiprocessing.connection import Connection
-from typing import Any, NamedTuple
+from logging import getLogger
+from multiprocessing.connection import Connection, wait
+from multiprocessing.util import Finalize, get_temp_dir
+from typing import Any, Protocol
 
 import cloudpickle
 import torch
@@ -18,15 +19,43 @@ import torch.multiprocessing as mp
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from pgkit.collectors.stepping import Share, allocate, regroup
-from pgkit.compiled import Mode, load_matmul_state, matmul_state
+from pgkit.collectors.serving import Order, Request, how_it_ended, serve, spared, stop
+from pgkit.collectors.stepping import allocate, lost, regroup
+from pgkit.compiled import Mode, matmul_state
 from pgkit.envs import VectorEnv
-from pgkit.errors import UserError
-from pgkit.seams import Entries
+from pgkit.errors import EnvironmentFailed, EnvironmentHung, UserError
+from pgkit.seams import Entries, Key
+
+STEPS: Key = ("next", "step_count")
+_START: Request = ("start", None)
 
 
-class WorkerEnded(RuntimeError):
-    """A process is gone without an answer."""
+class Pool(Protocol):
+    """Processes that share environments, wherever they are: :meth:`begin`, then :meth:`finish`."""
+
+    def begin(self, weights: Iterable[Tensor], step: int, random: bool = False) -> None: ...
+
+    @property
+    def is_open(self) -> bool: ...
+
+    def ready(self) -> bool: ...
+
+    def wait_any(self, pools: Sequence[Any], /) -> bool: ...
+
+    def finish(self) -> Entries: ...
+
+    def state_dict(self) -> list[dict[str, Any]]: ...
+
+    def load_state_dict(self, states: list[dict[str, Any]], /) -> None: ...
+
+    def close(self) -> Any: ...
+
+
+MakePool = Callable[..., Pool]
+
+
+class WorkerEnded(EnvironmentFailed):
+    """A process is gone without an answer, or does not answer."""
 
 
 class Workers:
@@ -35,6 +64,10 @@ class Workers:
     The rollout and the policy's weights are in shared memory: a rollout costs two messages a process. Each process
     evaluates the policy on its own rows only.
 
+    With ``env.restart_workers``, a process that has ended or hangs is replaced: the new one gets the state of its
+    environments as of the last rollout, and collects this one again, to the same numbers. Where it ends again, its
+    environments begin new episodes; the third time is an error.
+
     Args:
         env: all the environments.
         actor: the policy, on the CPU.
@@ -42,6 +75,9 @@ class Workers:
         outputs: examples of what the policy writes.
         compile: compile the policy.
         bounds: the environments ``bounds[i]`` to ``bounds[i + 1]`` are process i's; None: all, evenly.
+
+    Attributes:
+        episodes_lost: episodes that the replaced processes did not go on with.
     """
 
     def __init__(
@@ -53,33 +89,57 @@ class Workers:
         compile: Mode,
         bounds: Sequence[int] | None = None,
     ) -> None:
-        self._actor = copy.deepcopy(actor).requires_grad_(False).share_memory()
-        self._buffers = {key: x.share_memory_() for key, x in allocate(steps, env, outputs).items()}
-        context = _context()
-        self._bounds = list(bounds or shares(env))
-        self.pipes: list[Connection] = []
-        processes = []
-        for first, end in pairwise(self._bounds):
-            ours, theirs = context.Pipe()
-            columns = {key: x[:, first:end] for key, x in self._buffers.items()}
-            order = _Order(
-                cloudpickle.dumps(env.make), first, end - first, env.num_envs, env.seed, self._actor, outputs, columns,
-                compile, matmul_state(),
-            )  # fmt: skip
-            process = context.Process(target=_serve, args=(theirs, order), daemon=True)
-            process.start()
-            theirs.close()
-            self.pipes.append(ours)
-            processes.append(process)
-        self.close = weakref.finalize(self, _stop, self.pipes, processes)
-        self._asked = [True] * len(self.pipes)  # whose answer is not read yet: the first one says that it is up
         try:
+            self._actor = copy.deepcopy(actor).requires_grad_(False).share_memory()
+            self._buffers = {key: x.share_memory_() for key, x in allocate(steps, env, outputs).items()}
+        except RuntimeError as error:
+            raise UserError(f"the workers' rollouts need shared memory: {str(error).splitlines()[0]}") from error
+        self._env, self._bounds, self._step, self.episodes_lost = env, list(bounds or shares(env)), 0, 0
+        make = cloudpickle.dumps(env.make)
+        self._orders = [
+            Order(
+                make, first, end - first, env.num_envs, env.seed, self._actor, outputs,
+                {key: x[:, first:end] for key, x in self._buffers.items()}, compile, matmul_state(),
+                env.restart_workers, get_temp_dir(),
+            )
+            for first, end in pairwise(self._bounds)
+        ]  # fmt: skip
+        self.pipes: list[Connection] = []
+        self._processes: list[Any] = []
+        # at the interpreter's end before multiprocessing waits for its processes, which do not heed its SIGTERM
+        self.close = Finalize(self, stop, (self.pipes, self._processes), exitpriority=10)
+        self._asked: list[Request | None] = [None] * len(self._orders)  # whose answer is not read yet
+        self._states: list[bytes | None] = [None] * len(self._orders)  # as of the last rollout, if any is replaced
+        try:
+            for i in range(len(self._orders)):
+                self._start(i)
             self._answers()  # the processes are up
+        except OSError as error:
+            raise UserError(
+                f"{len(self._orders)} worker processes cannot be started: {error.strerror}; give fewer --workers, or "
+                "raise the limit (ulimit)"
+            ) from error
         except WorkerEnded as error:
             raise UserError(
                 "a collector worker ended before it began: what starts workers in a script belongs inside "
                 "`if __name__ == '__main__':`, as every worker imports the script; the lines above may tell more"
             ) from error
+
+    def _start(self, i: int) -> None:
+        """Starts process i, which says first that it is up."""
+        ours, theirs = _context().Pipe()
+        self.pipes[i : i + 1] = [ours]
+        with spared():
+            process = _context().Process(target=serve, args=(theirs, self._orders[i]), daemon=True)
+            process.start()
+            self._processes[i : i + 1] = [process]
+        theirs.close()
+        self._asked[i] = _START
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the processes run: any failure ends them all."""
+        return self.close.still_active()
 
     def begin(self, weights: Iterable[Tensor], step: int, random: bool = False) -> None:
         """Starts a rollout with these weights, the values of the actor's ``state_dict()``; as :meth:`Share.collect`."""
@@ -87,11 +147,19 @@ class Workers:
         with torch.no_grad():
             for mine, theirs in zip(self._actor.state_dict().values(), weights, strict=True):
                 mine.copy_(theirs)
-        self._send([("collect", (step, random))] * len(self.pipes))
+        if self._env.env_timeout is not None:
+            self._buffers[STEPS].fill_(-1)  # shows how far a process has come
+        self._step = step
+        for i in range(len(self.pipes)):
+            self._send(i, ("collect", (step, random)))
 
     def ready(self) -> bool:
         """Whether :meth:`finish` would not wait."""
         return all(pipe.poll() for pipe in self.pipes)
+
+    def wait_any(self, pools: Sequence[Workers]) -> bool:
+        """Waits until one of these has something to say; False: none has within the time that a step may take."""
+        return bool(wait([pipe for workers in pools for pipe in workers.pipes], self._env.env_timeout))
 
     def finish(self) -> Entries:
         """The rollout's buffers ``[T, N, ...]`` of this object's environments, the caller's to keep."""
@@ -100,42 +168,101 @@ class Workers:
 
     def state_dict(self) -> list[dict[str, Any]]:
         """The state of every process's share."""
-        return self._ask([("state", None)] * len(self.pipes))
+        return [pickle.loads(state) for state in self._ask([("state", None)] * len(self.pipes))]
 
     def load_state_dict(self, states: list[dict[str, Any]]) -> None:
         """Gives every process its share of :meth:`state_dict`, taken with any number of processes."""
-        self._ask([("load", state) for state in regroup(states, self._bounds)])
+        self._states = [pickle.dumps(state) for state in regroup(states, self._bounds)]
+        self._ask([("load", state) for state in self._states])
 
-    def _ask(self, requests: list[Any]) -> list[Any]:
+    def _ask(self, requests: list[Request]) -> list[Any]:
         self._answers()
-        self._send(requests)
+        for i, request in enumerate(requests):
+            self._send(i, request)
         return self._answers()
 
-    def _send(self, requests: list[Any]) -> None:
-        for i, (pipe, request) in enumerate(zip(self.pipes, requests, strict=True)):
-            self._asked[i] = True
-            pipe.send(request)
+    def _send(self, i: int, request: Request) -> None:
+        self._asked[i] = request
+        with contextlib.suppress(ConnectionError):  # it is gone, as its answer will show
+            self.pipes[i].send(request)
 
     def _answers(self) -> list[Any]:
         """Waits for the answer of every process that was asked, and returns them."""
-        answers = []
-        for i, pipe in enumerate(self.pipes):
-            if not self._asked[i]:
-                continue
+        try:
+            return [self._answer(i) for i, asked in enumerate(self._asked) if asked is not None]
+        except Exception:
+            self.close()
+            raise
+
+    def _answer(self, i: int) -> Any:
+        """The answer of process i, or of the one that takes its place."""
+        asked = self._asked[i]
+        assert asked is not None
+        replaces = self._env.restart_workers and asked != _START
+        ended: WorkerEnded | None = None
+        for chance in range(3 if replaces else 1):
             try:
-                answer, failure = pipe.recv()
-                self._asked[i] = False
-            except (EOFError, ConnectionError):
-                self.close()
-                raise WorkerEnded(f"collector worker {i} ended (killed, or out of memory)") from None
-            if isinstance(failure, UserError):
-                self.close()
-                raise failure
-            if failure:
-                self.close()
-                raise RuntimeError(f"collector worker {i} failed:\n{failure}")
-            answers.append(answer)
-        return answers
+                if ended is not None:
+                    self._replace(i, ended, asked, anew=chance == 2)
+                return self._receive(i)
+            except WorkerEnded as error:
+                ended = error
+        assert ended is not None
+        raise ended
+
+    def _receive(self, i: int) -> Any:
+        try:
+            self._wait(i)
+            answer, failure = self.pipes[i].recv()
+        except (EOFError, ConnectionError):
+            raise WorkerEnded(f"{self._name(i)} {how_it_ended(self._processes[i])}") from None
+        if isinstance(failure, EnvironmentHung) and self._env.restart_workers:
+            raise WorkerEnded(failure.line, failure.frames)
+        if isinstance(failure, str):
+            raise RuntimeError(f"collector worker {i} failed:\n{failure}")
+        if failure is not None:
+            raise failure
+        if self._collects(i) and self._env.restart_workers:
+            self._states[i] = answer
+        self._asked[i] = None
+        return answer
+
+    def _wait(self, i: int) -> None:
+        """Waits for an answer; ``WorkerEnded`` where a process makes no step for longer than a step may take."""
+        limit, before = self._env.env_timeout, -1
+        while limit is not None and not self.pipes[i].poll(2 * limit):  # it should have said so itself by now
+            made = int((self._buffers[STEPS][:, self._bounds[i]] >= 0).sum())
+            if made == before and self._collects(i):
+                raise WorkerEnded(f"{self._name(i)} has made no step for {2 * limit:g} s (--env-timeout {limit:g})")
+            before = made
+
+    def _replace(self, i: int, ended: WorkerEnded, asked: Request, anew: bool) -> None:
+        """Starts a process in place of one that is gone, brings its environments back, and asks again."""
+        first, end = self._bounds[i : i + 2]
+        anew |= self._env.resume != "exact"
+        self.episodes_lost += (end - first) * anew
+        getLogger("pgkit").warning(
+            "%s; a new process takes its place: its environments %s", ended.line,
+            f"begin new episodes ({self.episodes_lost:,} lost so far)" if anew else "go on where they were",
+        )  # fmt: skip
+        state = pickle.dumps(lost(self._step)) if anew else self._states[i]
+        self._processes[i].kill()
+        self.pipes[i].close()
+        self._start(i)
+        for request in (asked,) if state is None else (("load", state), asked):
+            self._receive(i)
+            self._send(i, request)
+
+    def _collects(self, i: int) -> bool:
+        asked = self._asked[i]
+        return asked is not None and asked[0] == "collect"
+
+    def _name(self, i: int) -> str:
+        first, end = self._bounds[i : i + 2]
+        return (
+            f"collector worker {i} (environments {first} to {end - 1} of {self._env.env_id}, seed {self._env.seed}), "
+            f"in the rollout from step {self._step:,} on,"
+        )
 
 
 def _context() -> Any:
@@ -161,56 +288,3 @@ def check_splits(env: VectorEnv) -> None:
             f"the {env.env_id} given is in this process, workers make their own: give envs.make a function that "
             "makes one, or use collectors.VectorCollector with workers=1"
         )
-
-
-class _Order(NamedTuple):
-    """What a worker is given."""
-
-    make: bytes
-    first: int
-    count: int
-    num_envs: int
-    seed: int
-    actor: TensorDictModuleBase
-    outputs: Entries
-    buffers: Entries
-    compile: Mode
-    matmul: dict[str, Any]
-
-
-def _serve(pipe: Connection, order: _Order) -> None:
-    """A worker's life: answers ``(answer, failure)`` to every request until the pipe closes."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
-    try:
-        torch.set_num_threads(1)
-        load_matmul_state(order.matmul)
-        simulator = cloudpickle.loads(order.make)(order.first, order.count, order.seed)
-        share = Share(
-            simulator, order.first, order.num_envs, order.seed, order.actor, order.outputs, order.buffers, order.compile
-        )
-        pipe.send((None, None))
-        while True:
-            request, argument = pipe.recv()
-            answer = None
-            if request == "collect":
-                share.collect(*argument)
-            elif request == "state":
-                answer = share.state_dict()
-            else:
-                share.load_state_dict(argument)
-            pipe.send((answer, None))
-    except (EOFError, ConnectionError):
-        pass
-    except UserError as error:
-        pipe.send((None, error))
-    except Exception:
-        pipe.send((None, traceback.format_exc()))
-
-
-def _stop(pipes: list[Connection], processes: list[Any]) -> None:
-    for pipe in pipes:
-        pipe.close()
-    for process in processes:
-        process.join(timeout=5)
-        if process.is_alive():
-            process.kill()

@@ -15,7 +15,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from pgkit.compiled.constants import Constants, tensors_of
-from pgkit.compiled.native import compile_record, torch_compiled
+from pgkit.compiled.native import check_shapes, compile_record, torch_compiled
 from pgkit.compiled.recorded import Bind, Function, Recorder, recorded
 from pgkit.compiled.trial import check_repeats
 from pgkit.errors import UserError
@@ -36,6 +36,11 @@ def check_compile(compile: str) -> None:
         raise UserError(f"compile is 'auto', 'on' or 'off', not {compile!r}")
 
 
+def has_compiler() -> bool:
+    """Whether this machine has a C++ compiler."""
+    return any(map(shutil.which, ("g++", "clang++")))
+
+
 def choose(compile: str, calls: float | None, least_calls: float) -> Mode:
     """The door's mode for the user's choice ``auto``, ``on`` or ``off``.
 
@@ -45,7 +50,7 @@ def choose(compile: str, calls: float | None, least_calls: float) -> Mode:
         least_calls: number of calls that win the compile time back.
     """
     check_compile(compile)
-    if compile == "auto" and shutil.which("g++") is None and shutil.which("clang++") is None:
+    if compile == "auto" and not has_compiler():
         getLogger("pgkit").warning("no C++ compiler (g++) found: running without torch.compile, about 3 times slower")
         return "off"
     return "off" if compile == "auto" and calls is not None and calls < least_calls else cast(Mode, compile)
@@ -72,7 +77,9 @@ class Compiled:
         name: what the log calls it: ``the update``.
         holds: further tensors that it changes or that change in place: optimizer state, priorities, a cache.
         but: names of attributes whose changes say nothing.
+        agree: whether all of several learners took a rung, from whether this one did.
         most: operations that are worth compiling, of a function that may be a long loop; it skips ``torch.compile``.
+        fixed: refuses a record in which values decide how many elements something has.
 
     Attributes:
         seconds: spent recording and compiling so far.
@@ -85,8 +92,10 @@ class Compiled:
     mode: Mode
     name: str
     holds: Sequence[Tensor] = ()
+    agree: Callable[[bool], bool] = bool
     most: int | None = None
     but: Collection[str] = ()
+    fixed: bool = False
     seconds: float = field(default=0.0, init=False)
     rung: str = field(default=EAGER, init=False)
     _built: dict[Any, Bind] = field(default_factory=dict, init=False)
@@ -127,15 +136,19 @@ class Compiled:
             if rung == TRACED and self.most is not None:
                 continue
             self.rung = rung
+            bind = None
             try:
                 bind = self._climb(data, inputs)
-                self._say(failed)
-                return bind
             except UserError:
                 raise
             except Exception as error:  # compilers, and a torch whose private parts have moved, raise anything
                 failed.append(f"{rung}: {str(error).strip().partition(chr(10))[0] or type(error).__name__}")
                 last = error
+            if self.agree(bind is not None) and bind is not None:
+                self._say(failed)
+                return bind
+            if bind is not None:
+                failed.append(f"{rung}: another learner cannot")
         raise UserError(
             f"{self.name} cannot be compiled ({'; '.join(failed)}): compile='auto' runs it without, compile='off' does "
             "not try"
@@ -167,6 +180,8 @@ class Compiled:
         return bind
 
     def _compile(self, graph: Any, inputs: Sequence[Tensor]) -> Callable[..., Any]:
+        if self.fixed:
+            check_shapes(graph)
         if self.rung == REPLAYED:
             return graph.forward
         if self.most is not None and len(graph.graph.nodes) > self.most:

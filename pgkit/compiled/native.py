@@ -18,6 +18,7 @@ from torch.fx import GraphModule, Node
 from torch.fx.experimental.proxy_tensor import make_fx
 from torch.fx.subgraph_rewriter import replace_pattern
 
+from pgkit.compiled.convolutions import halve_convolutions
 from pgkit.compiled.products import as_they_are, fastest_products
 
 # the same random numbers as eager code
@@ -45,31 +46,52 @@ def record(function: Callable[..., Any], inputs: Sequence[Tensor]) -> GraphModul
 
 
 def _mask_in_place(graph: GraphModule) -> None:
-    """Rewrites ``x[mask] -= 1``, which picks as many elements as the mask's values say, for all elements of ``x``."""
+    """Rewrites ``x[mask] -= 1`` and ``x[mask] = y[mask]``, which pick as many elements as the mask says, for all."""
     aten = torch.ops.aten
     for put in graph.graph.find_nodes(op="call_function", target=aten.index_put_.default):
-        x, masks, pick = put.args[:3]
-        while pick.target is not aten.index.Tensor and _is_elementwise(pick):
+        x, masks, value = put.args[:3]
+        pick, views = value, []
+        while pick.target is not aten.index.Tensor and (_is_elementwise(pick) or pick.target is aten.view.default):
+            views += [pick] if pick.target is aten.view.default else []  # of one picked element, without its dimension
             (pick,) = _with_dimensions(pick)
-        if pick.args != (x, masks) or len(pick.users) != 1 or not _is_mask(masks, x):
+        same = pick.target is aten.index.Tensor and pick.args[1] == masks and len(pick.users) == 1
+        if not (same and _is_mask(masks, x) and cast(Node, pick.args[0]).meta["val"].shape == x.meta["val"].shape):
             continue
         with graph.graph.inserting_before(pick):
-            whole = graph.graph.call_function(aten.clone.default, (x,))
-        with graph.graph.inserting_before(put):
-            masked = graph.graph.call_function(aten.where.self, (masks[0], put.args[2], x))
-            written = graph.graph.call_function(aten.copy_.default, (x, masked))
-        whole.meta["val"] = written.meta["val"] = x.meta["val"]
+            whole = graph.graph.call_function(aten.clone.default, (pick.args[0],))
+        whole.meta["val"] = x.meta["val"]
         pick.replace_all_uses_with(whole)
+        for view in views:
+            view.replace_all_uses_with(view.args[0])
+            graph.graph.erase_node(view)
+        with graph.graph.inserting_before(put):
+            mask, rest = masks[0], x.meta["val"].ndim - masks[0].meta["val"].ndim
+            for _ in range(rest):
+                mask = graph.graph.call_function(aten.unsqueeze.default, (mask, -1))
+            masked = graph.graph.call_function(aten.where.self, (mask, put.args[2], x))
+            written = graph.graph.call_function(aten.copy_.default, (x, masked))
+        written.meta["val"] = x.meta["val"]
         put.replace_all_uses_with(written)
         graph.graph.erase_node(put)
         graph.graph.erase_node(pick)
     graph.recompile()
 
 
+def check_shapes(graph: GraphModule) -> None:
+    """A ``RuntimeError`` for an operation whose result has as many elements as the values of a mask say."""
+    for node in graph.graph.find_nodes(op="call_function", target=torch.ops.aten.index.Tensor):
+        if any(index is not None and index.meta["val"].dtype is torch.bool for index in node.args[1]):
+            raise RuntimeError("values decide how many elements it picks (x[mask]): use torch.where")
+    for node in graph.graph.nodes:
+        counts = node.target is not torch.ops.aten.index.Tensor and node.op == "call_function"
+        if counts and torch.Tag.dynamic_output_shape in getattr(node.target, "tags", ()):
+            raise RuntimeError(f"values decide how many elements {node.target} gives: use torch.where")
+
+
 def _is_mask(index: Sequence[Node | None], x: Node) -> bool:
-    """Whether an index is one boolean tensor of the shape of ``x``."""
+    """Whether an index is one boolean tensor, of the shape of ``x`` or of its first dimensions."""
     mask = index[0].meta["val"] if len(index) == 1 and index[0] is not None else None
-    return mask is not None and mask.dtype is torch.bool and mask.shape == x.meta["val"].shape
+    return mask is not None and mask.dtype is torch.bool and mask.shape == x.meta["val"].shape[: mask.ndim]
 
 
 def _is_elementwise(node: Node) -> bool:
@@ -106,6 +128,7 @@ def compile_record(graph: GraphModule, inputs: Sequence[Tensor]) -> Callable[...
 
     (results,) = graph.graph.output_node().args
     fastest_products(graph)
+    halve_convolutions(graph)
     constants = _as_inputs(graph)
     tensors, options = [*inputs, *constants], _OPTIONS
     if all(x.device.type == "cpu" for x in tensors):

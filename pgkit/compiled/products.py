@@ -64,6 +64,11 @@ def load_matmul_state(state: Mapping[str, Any], setting: bool = True) -> None:
     _choices.update(state.get("choices", {}))  # an earlier pgkit saved none
 
 
+def in_bfloat16() -> bool:
+    """Whether the setting allows bfloat16."""
+    return _setting == "bf16"
+
+
 def tolerances() -> dict[str, float]:
     """How far what is compiled may lie from the function: bfloat16 has 8 bits, float32 has 24."""
     return {"rtol": 5e-2, "atol": 1e-2} if _setting == "bf16" else {"rtol": 1e-3, "atol": 1e-4}
@@ -107,18 +112,28 @@ def _factors(node: Node) -> tuple[Node, Node] | None:
 
 def _choice(x: Tensor, y: Tensor) -> str:
     """The kernel of a product, measured where nobody has chosen yet."""
-    laid_out = " @ ".join(f"{tuple(z.shape)} strides {tuple(z.stride())}" for z in (x, y))
-    product = f"{_setting}, {torch.get_num_threads()} threads: {laid_out}"
-    if product not in _choices:
-        file = _file()
-        _choices.update({key: name for key, name in _read(file).items() if key not in _choices})
-        if product not in _choices:
-            _choices[product] = _measured(x, y)
-            _write(file, product)
-    name = _choices[product]
+    product = " @ ".join(map(layout, (x, y)))
+    name = chosen(product, lambda: _measured(x, y))
     if name not in _kernels():
         getLogger("pgkit").warning("%s was made by %s, which is not here: torch's own now", product, name)
     return name if name in _kernels() else "torch"
+
+
+def layout(x: Tensor) -> str:
+    """Shape and strides in words."""
+    return f"{tuple(x.shape)} strides {tuple(x.stride())}"
+
+
+def chosen(what: str, measure: Callable[[], str]) -> str:
+    """The name chosen for this, with this setting and as many threads: here, in the file, or by measuring."""
+    key = f"{_setting}, {torch.get_num_threads()} threads: {what}"
+    if key not in _choices:
+        file = _file()
+        _choices.update({key: name for key, name in _read(file).items() if key not in _choices})
+        if key not in _choices:
+            _choices[key] = measure()
+            _write(file, key)
+    return _choices[key]
 
 
 def _kernels() -> dict[str, Callable[[Any, Any, torch.Size], Any]]:
@@ -132,9 +147,7 @@ def _kernels() -> dict[str, Callable[[Any, Any, torch.Size], Any]]:
 
 
 def _torch(x: Any, y: Any, shape: torch.Size) -> Any:
-    if len(shape) == 3:
-        return _aten.bmm.default(x, y)
-    return _aten.squeeze.dim(_aten.bmm.default(_aten.unsqueeze.default(x, 0), _aten.unsqueeze.default(y, 0)), 0)
+    return _aten.bmm.default(x, y) if len(shape) == 3 else _aten.mm.default(x, y)
 
 
 def _onednn(linear: Any, x: Any, y: Any, shape: torch.Size) -> Any:
@@ -150,20 +163,25 @@ def _bf16(x: Any, y: Any, shape: torch.Size) -> Any:
 
 
 def _measured(x: Tensor, y: Tensor) -> str:
-    """The fastest kernel for numbers laid out like these: the best time of each counts, in alternation."""
-    x, y = _like(x), _like(y)
-    best, start, rounds = dict.fromkeys(_kernels(), math.inf), time.perf_counter(), 0
+    """The fastest kernel for numbers laid out like these."""
+    x, y = like(x), like(y)
+    return fastest({name: partial(kernel, x, y, x.shape) for name, kernel in _kernels().items()})
+
+
+def fastest(kernels: Mapping[str, Callable[[], Any]]) -> str:
+    """The name of the fastest, torch's own if none is clearly faster: the best time of each counts, in alternation."""
+    best, start, rounds = dict.fromkeys(kernels, math.inf), time.perf_counter(), 0
     while rounds < 3 or (rounds < _ROUNDS and time.perf_counter() - start < _SECONDS):
-        for name, kernel in _kernels().items():
+        for name, kernel in kernels.items():
             begin = time.perf_counter()
-            kernel(x, y, x.shape)
+            kernel()
             best[name] = min(best[name], time.perf_counter() - begin)
         rounds += 1
     first = min(best, key=lambda name: best[name])
     return first if best[first] < _MARGIN * best["torch"] else "torch"
 
 
-def _like(x: Tensor) -> Tensor:
+def like(x: Tensor) -> Tensor:
     """Random numbers in the layout of a tensor of the recording, which has none."""
     size = 1 + sum((size - 1) * stride for size, stride in zip(x.shape, x.stride(), strict=True))
     return torch.randn(size, generator=torch.Generator(), dtype=x.dtype).as_strided(tuple(x.shape), tuple(x.stride()))

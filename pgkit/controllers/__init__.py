@@ -1,7 +1,7 @@
 """What sets a loss's coefficient while it trains."""
 
 from pgkit.controllers.adaptive_kl import AdaptiveKL, FixedKL
-from pgkit.controllers.schedules import Schedule, constant, linear
+from pgkit.controllers.schedules import Schedule, constant, cosine, linear
 from pgkit.controllers.temperature import FixedTemperature, Temperature
 
 __all__ = [
@@ -11,5 +11,6 @@ __all__ = [
     "Schedule",
     "Temperature",
     "constant",
+    "cosine",
     "linear",
 ]

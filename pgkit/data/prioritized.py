@@ -15,8 +15,9 @@ from pgkit.errors import within
 class Prioritized:
     r"""Draws frame :math:`i` with probability :math:`p_i^\alpha / \sum_j p_j^\alpha`, :math:`p = |\delta| + \epsilon`.
 
-    New frames get the largest priority so far. The update writes the errors of its batches back. A batch has
-    ``priority_weight``, the importance weights :math:`(N P(i))^{-\beta}` divided by the batch's largest.
+    New frames get the largest priority so far, or that of the error they come with. The update writes the errors of its
+    batches back. A batch has ``priority_weight``, the importance weights :math:`(N P(i))^{-\beta}` divided by the
+    batch's largest.
 
     Args:
         alpha: how much the priorities count; 0 draws uniformly.
@@ -45,10 +46,13 @@ class Prioritized:
         """Changes ``beta`` from the next batch on."""
         self.beta.fill_(beta)
 
-    def extend(self, new: Tensor, gone: Tensor) -> None:
-        """Takes the rows ``gone`` out and gives the rows ``new`` the largest priority."""
+    def extend(self, new: Tensor, gone: Tensor, td_error: Tensor | None = None) -> None:
+        """Takes the rows ``gone`` out; the rows ``new`` get the priorities of their errors, or the largest one."""
         self.tree.set(gone, 0.0)
-        self.tree.set(new, self.largest)
+        if td_error is None:
+            self.tree.set(new, self.largest)
+        elif len(new):
+            self.write_back(new.to(td_error.device), td_error)
 
     def sample(self, batches: int, batch_size: int, generator: torch.Generator) -> Tensor:
         """Rows ``[batches, batch_size]``; drawn on the CPU, the generator's device."""

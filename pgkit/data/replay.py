@@ -86,6 +86,7 @@ class ReplayBuffer:
             storage=storage, device=self.device,
         )  # fmt: skip
         self.data = self.table.data
+        self._errors: Tensor | None = None
         if sampler is not None:
             self.data["weighting"] = sampler.begin(self.rows, self.device)
         self.generator = torch.Generator().manual_seed(int(torch.randint(2**62, ())) if seed is None else seed)
@@ -113,6 +114,9 @@ class ReplayBuffer:
     def extend(self, rollout: TensorDictBase) -> None:
         """Writes a rollout ``[num_envs, T]`` (or ``[num_envs]``: one step) with TorchRL's ``next`` entries.
 
+        Where draws are prioritized, an entry ``td_error [num_envs, T]`` has the frames' first errors. Without one, they
+        get the largest priority so far.
+
         Rollouts need not continue one another: where an observation is not the one that the frame before led to,
         that frame keeps its own.
 
@@ -138,8 +142,18 @@ class ReplayBuffer:
             | {key: after(key) for key in ("reward", "terminated", "done")},
         )
         if self.sampler is not None:
-            new = torch.arange(max(ready, self.start), self.start + len(self))
-            self.sampler.extend(new % self.rows, torch.arange(oldest, self.start) % self.rows)
+            new = torch.arange(max(ready, self.start), self.start + len(self)) % self.rows
+            self.sampler.extend(new, torch.arange(oldest, self.start) % self.rows, self._first_errors(rollout, new))
+
+    def _first_errors(self, rollout: TensorDictBase, new: Tensor) -> Tensor | None:
+        """The errors that the rows ``new`` came with: with n-step returns some are of the rollout before."""
+        if "td_error" not in rollout.keys():
+            return None
+        errors = self._rows_of("rollout", rollout, "td_error")
+        if self._errors is None:
+            self._errors = torch.zeros(self.rows, dtype=errors.dtype, device=self.device)
+        self._errors[torch.arange(self.written - len(errors), self.written) % self.rows] = errors
+        return self._errors[new]
 
     def _rows_of(self, name: str, data: TensorDictBase, key: Any) -> Tensor:
         """An entry of a rollout ``[columns, T]`` in time order, ``[T * columns, ...]``: the newest that fit."""

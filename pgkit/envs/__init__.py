@@ -10,6 +10,7 @@ from pgkit.envs.prompts import Prompts, prompts
 from pgkit.envs.tokenizers import Characters
 from pgkit.envs.torch_batch import Torch
 from pgkit.envs.vector import VectorEnv
+from pgkit.envs.vmas_batch import Vmas
 
 gym.register("pgkit/TMaze-v0", entry_point="pgkit.envs.tmaze:TMaze", max_episode_steps=40)
 
@@ -20,6 +21,7 @@ __all__ = [
     "Prompts",
     "Torch",
     "VectorEnv",
+    "Vmas",
     "make",
     "make_one",
     "prompts",

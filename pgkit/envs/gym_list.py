@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from typing import Any, Literal, NoReturn
 
 import gymnasium as gym
 import numpy as np
@@ -13,6 +13,7 @@ from torchrl.data import Composite
 
 from pgkit.envs import spaces
 from pgkit.envs.checks import FLAGS, NUMBERS, WRONG, check_step, checked_reset, checked_space, misshapen
+from pgkit.envs.failures import FAILURES, LONGEST, fail, in_episode, warn_of_length
 from pgkit.envs.numpy_entries import Info, Infos, Observations, Totals, flags, rewards
 from pgkit.envs.seeding import episode_seed
 from pgkit.errors import UserError
@@ -24,8 +25,9 @@ class Gymnasium:
 
     An episode that ends is reset within the same step. Every episode is seeded from ``(seed, index of the environment,
     number of the episode)``, so the state of a deterministic simulator is those numbers and the actions since: that
-    is what :meth:`state_dict` stores and :meth:`load_state_dict` replays, bit for bit. With ``reseed=False`` an
-    environment is seeded once, and a resume begins new episodes.
+    is what :meth:`state_dict` stores and :meth:`load_state_dict` replays, bit for bit. Of an episode beyond 100,000
+    steps the actions are dropped: there, a resume begins the next episode. With ``reseed=False`` an environment is
+    seeded once, and a resume begins new episodes.
 
     Args:
         envs: the environments.
@@ -71,7 +73,7 @@ class Gymnasium:
             self._next.tensors, self._totals.rewards, self._totals.ends, self._totals.cuts, self._infos.tensors,
             self._fresh.tensors,
         )  # fmt: skip
-        self._stepped = False
+        self._stepped = self._warned = False
         self._restart(seed)
 
     def _restart(self, seed: int) -> None:
@@ -82,6 +84,7 @@ class Gymnasium:
         self._episode = np.full(self.num_envs, -1)
         self._taken: list[np.ndarray] = []  # actions [N, ...] of the last steps
         self._since = np.zeros(self.num_envs, np.int64)  # where in those each episode begins
+        self._endless = np.zeros(self.num_envs, bool)  # whose episode is too long to be replayed
 
     def reset(self, seed: int | None = None, rows: Tensor | None = None) -> Entries:
         """As :meth:`pgkit.seams.Simulator.reset`."""
@@ -96,13 +99,35 @@ class Gymnasium:
         self._episode[i] += 1
         seeds = self.reseed or not self._seeded[i]
         seed = episode_seed(self.seed, self.first + i, int(self._episode[i])) if seeds else None
-        self._write(i, checked_reset(self.envs[i], seed, self.options), "reset")
-        self._begun[i] = self._seeded[i] = True
+        try:
+            obs = checked_reset(self.envs[i], seed, self.options)
+        except FAILURES as error:
+            fail(in_episode(self.envs[i].unwrapped, self.first + i, 0, seed), error)
+        self._write(i, obs, "reset")
+        self._begun[i], self._seeded[i], self._endless[i] = True, True, False
         self._since[i] = len(self._taken)
+        if 2 * int(self._since.min()) > len(self._taken):  # more than half belongs to episodes that are over
+            self._forget()
+
+    def _forget(self) -> None:
+        """Drops the actions that belong to no running episode."""
         oldest = int(self._since.min())
-        if 2 * oldest > len(self._taken):  # more than half belongs to episodes that are over
-            del self._taken[:oldest]
-            self._since -= oldest
+        del self._taken[:oldest]
+        self._since -= oldest
+
+    def _give_up(self) -> None:
+        """Drops the actions of episodes that have become too long."""
+        for i in np.flatnonzero(len(self._taken) - self._since > LONGEST):
+            if not self._warned:
+                self._warned = True
+                warn_of_length(self.envs[i].unwrapped, self.first + int(i))
+            self._endless[i], self._since[i] = True, len(self._taken)
+        self._forget()
+
+    def _fail(self, i: int, error: BaseException) -> NoReturn:
+        seed = episode_seed(self.seed, self.first + i, int(self._episode[i]))
+        step = int(self._totals.step_count[i]) + 1
+        fail(in_episode(self.envs[i].unwrapped, self.first + i, step, seed), error)
 
     def _write(self, i: int, obs: Any, method: str) -> None:
         try:
@@ -122,7 +147,10 @@ class Gymnasium:
         if infos is not None:
             infos.clear()
         for i, env in enumerate(self.envs):
-            result = env.step(given[i])
+            try:
+                result = env.step(given[i])
+            except FAILURES as error:
+                self._fail(i, error)
             if looks or type(result) is not tuple or len(result) != 5:
                 check_step(env, actions[i], result)
             obs, gained, ended, cut, info = result
@@ -137,6 +165,8 @@ class Gymnasium:
                 infos.write(i, info)
         if self.reseed:
             self._taken.append(actions)
+        if len(self._taken) > LONGEST:
+            self._give_up()
         self._stepped = True
         totals.count()
         if self.clip_rewards:
@@ -151,13 +181,20 @@ class Gymnasium:
     def state_dict(self) -> dict[str, Any]:
         """Of every environment the number of its episode and the actions since that began."""
         rows = [
-            {"episode": int(episode), "actions": np.array([actions[i] for actions in self._taken[since:]])}
-            for i, (episode, since) in enumerate(zip(self._episode, self._since, strict=True))
+            {
+                "episode": int(self._episode[i] + self._endless[i]),
+                "actions": np.array([] if self._endless[i] else [actions[i] for actions in self._taken[since:]]),
+            }
+            for i, since in enumerate(self._since)
         ]
         return {"seed": self.seed, "rows": rows}
 
     def load_state_dict(self, state: dict[str, Any]) -> Entries:
         """Restores every environment by replaying the actions of its current episode, or begins new ones."""
+        if "rows" not in state:  # they are lost: episodes with a number that none has had
+            self._restart(self.seed)
+            self._episode[:] = state["steps"]
+            return self.reset()
         self._restart(state["seed"])
         if not self.reseed:
             self._episode[:] = [row["episode"] for row in state["rows"]]

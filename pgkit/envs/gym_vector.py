@@ -13,6 +13,7 @@ from torchrl.data import Composite
 
 from pgkit.envs import spaces
 from pgkit.envs.checks import WRONG, misshapen
+from pgkit.envs.failures import FAILURES, fail, in_vector
 from pgkit.envs.numpy_entries import Info, Infos, Observations, Totals, flags, rewards
 from pgkit.envs.seeding import episode_seed
 from pgkit.errors import UserError
@@ -70,7 +71,10 @@ class GymnasiumVector:
             first_time = seed is not None or not self._steps
             self.seed, self._steps = (self.seed, self._steps) if seed is None else (seed, 0)
             seed = self.seed % (2**31 - self.num_envs)  # Gymnasium adds the environment's number; 31 bits
-            obs, _ = self.env.reset(seed=seed if first_time else None, options=self.options)
+            try:
+                obs, _ = self.env.reset(seed=seed if first_time else None, options=self.options)
+            except FAILURES as error:
+                fail(in_vector(self.env, self.first, self.num_envs, 0, seed), error)
             self._write(self._fresh, obs, "reset")
             self._totals.forget(np.ones(self.num_envs, bool))
             self._ended[:], self._begun = False, True
@@ -88,7 +92,11 @@ class GymnasiumVector:
         """As :meth:`pgkit.seams.Simulator.step`."""
         totals, counts = self._totals, ~self._ended if self.masks else None
         totals.forget(self._ended)
-        obs, reward, terminated, truncated, info = self.env.step(self.to_env(action["action"].numpy()))
+        actions = self.to_env(action["action"].numpy())
+        try:
+            obs, reward, terminated, truncated, info = self.env.step(actions)
+        except FAILURES as error:
+            fail(in_vector(self.env, self.first, self.num_envs, self._steps + 1, self.seed), error)
         self._write_totals(reward, terminated, truncated)
         totals.count()
         if counts is not None:

@@ -6,7 +6,7 @@ import inspect
 import sys
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import gymnasium as gym
 import torch
@@ -14,11 +14,13 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import VectorEnv as GymVectorEnv
 from torchrl.envs import EnvBase
 
+from pgkit.compiled import Mode, check_compile
 from pgkit.envs.action_repeat import ActionRepeat
 from pgkit.envs.agents import Names
 from pgkit.envs.gym_list import Gymnasium
 from pgkit.envs.gym_vector import GymnasiumVector
 from pgkit.envs.ids import changed, is_atari, make_one, rendered
+from pgkit.envs.limits import limited
 from pgkit.envs.numpy_entries import Info
 from pgkit.envs.parallel import Parallel, is_parallel, refuse_turns
 from pgkit.envs.pixels import FrameStack, Pixels
@@ -44,6 +46,8 @@ class Settings(NamedTuple):
     fast_render: bool = False
     reward_clipping: bool = False
     groups: Names | None = None
+    compile: str = "off"
+    env_timeout: float | None = None
     reseed: bool = True
     reset_options: Mapping[str, Any] | None = None
 
@@ -64,6 +68,9 @@ def make(
     fast_render: bool = False,
     reward_clipping: bool | None = None,
     groups: Names | None = None,
+    compile: str = "off",
+    env_timeout: float | None = None,
+    restart_workers: bool = False,
     reseed: bool = True,
     reset_options: Mapping[str, Any] | None = None,
     **kwargs: Any,
@@ -93,6 +100,14 @@ def make(
         reseed: every episode has a seed of its own, so that a resume can replay it. False seeds each environment once,
             for one that counts on a single stream of random numbers (a curriculum); a resume then begins new episodes.
         reset_options: given to every reset as Gymnasium's ``options``.
+        compile: ``auto`` records the step of a batched torch simulator (VMAS's, or a function that makes a TorchRL
+            ``EnvBase``) and compiles it: about ten times as fast, after up to a minute the first time. What cannot be
+            recorded runs as it is, with a line in the log; other environments have nothing to record. ``on``: then it
+            is a ``UserError``.
+        env_timeout: seconds that one step of a process's environments may take; None: any time.
+        restart_workers: a worker process that has ended or hangs is replaced. Its environments go on where they were,
+            those that cannot (:attr:`~pgkit.seams.Simulator.resume`) begin new episodes. It costs the state of every
+            environment with every rollout.
         **kwargs: passed to ``gymnasium.make``, to the dm_control task, or to the function or class.
 
     Raises:
@@ -102,6 +117,7 @@ def make(
     """
     if seed is None:
         raise UserError("seed=None: give a whole number; numpy.random.randint(2**31) is another in every run")
+    check_compile(compile)
     check_whole_number(0, seed=seed, num_envs=num_envs, workers=workers)
     check_whole_number(1, action_repeat=action_repeat, pixels=pixels, frame_stack=frame_stack)
     atari = is_atari(env_id)
@@ -112,9 +128,8 @@ def make(
             what = f"workers={workers}" if workers > 1 else f"{next(iter(kwargs))}=..."
             raise UserError(f"{what} with an environment that is made already: give a function that makes one")
         images = (pixels, stack, fast_render, clips)
-        given = Settings(
-            device, action_repeat, flatten, info, max_episode_steps, *images, groups, reseed, reset_options
-        )
+        rest = (max_episode_steps, *images, groups, compile, env_timeout, reseed, reset_options)
+        given = Settings(device, action_repeat, flatten, info, *rest)
         return _adopt(env_id, num_envs, seed, given)
     num_envs = 1 if num_envs is None else num_envs
     if num_envs < 1 or workers < 1 or workers > num_envs:
@@ -132,10 +147,12 @@ def make(
     elif isinstance(env_id, str) and pixels is not None:
         kwargs = rendered(env_id, pixels) | kwargs
     images = (None if atari else pixels, stack, fast_render, clips)
-    limit = None if limited else max_episode_steps
-    settings = Settings(device, action_repeat, flatten, info, limit, *images, groups, reseed, reset_options)
+    steps = None if limited else max_episode_steps
+    rest = (steps, *images, groups, compile, env_timeout, reseed, reset_options)
+    settings = Settings(device, action_repeat, flatten, info, *rest)
     function = _function(env_id, kwargs)
-    env = VectorEnv(partial(_share, function, settings), num_envs, seed, workers)
+    env = VectorEnv(partial(_limited, function, settings), num_envs, seed, workers)
+    env.env_timeout, env.restart_workers = env_timeout, restart_workers
     env.env_id = env_id if isinstance(env_id, str) else getattr(env_id, "__qualname__", type(env_id).__name__)
     if action_repeat > 1:
         env.env_id += f" (action repeat {action_repeat})"
@@ -162,7 +179,10 @@ def _adopt(env: EnvBase | GymVectorEnv, num_envs: int | None, seed: int, setting
     """An environment that is there already."""
     if isinstance(env, VectorEnv):
         raise UserError("envs.make was given what envs.make gives: use it as it is")
-    adopted = VectorEnv(lambda first, count, seed: _simulator(env, seed, first, settings), 1, seed, splits=False)
+    adopted = VectorEnv(
+        lambda first, count, seed: limited(_simulator(env, seed, first, settings), settings.env_timeout),
+        1, seed, splits=False,
+    )  # fmt: skip
     if num_envs not in (None, adopted.num_envs):
         raise UserError(f"num_envs={num_envs}: the {type(env).__name__} given is {adopted.num_envs}: leave it out")
     adopted.env_id = type(env).__name__
@@ -182,10 +202,16 @@ def _function(env_id: Any, kwargs: dict[str, Any]) -> Callable[..., Any]:
     return partial(env_id, **kwargs)
 
 
+def _limited(function: Callable[..., Any], settings: Settings, first: int, count: int, seed: int) -> Simulator:
+    """As :func:`_share`, with the limit on the time of a step."""
+    return limited(_share(function, settings, first, count, seed), settings.env_timeout)
+
+
 def _share(function: Callable[..., Any], settings: Settings, first: int, count: int, seed: int) -> Simulator:
     """The environments ``first`` to ``first + count``: what the function makes decides how."""
     own_seed = seed % 2**31 if first == 0 else episode_seed(seed, first, 0)
     given = {"num_envs": count, "seed": own_seed, "device": settings.device, "groups": settings.groups}
+    given |= {"compile": None if settings.compile == "off" else settings.compile}
     names = _named(function) - {name for name, value in given.items() if value is None}
     made = function(**{name: given[name] for name in names & given.keys()})
     if isinstance(made, EnvBase | GymVectorEnv):
@@ -199,6 +225,10 @@ def _share(function: Callable[..., Any], settings: Settings, first: int, count: 
         _only_for_single(settings, made)
         return made
     refuse_turns(made)
+    if settings.compile == "on":
+        raise UserError(
+            f"compile='on' records batched torch simulators, a {type(made).__name__} is none: 'auto' or 'off'"
+        )
     rest = []
     for i in range(first + 1, first + count):
         given["seed"] = episode_seed(seed, i, 0)
@@ -255,9 +285,11 @@ def _simulator(env: EnvBase | GymVectorEnv, seed: int, first: int, settings: Set
         raise UserError(f"reseed=False: {type(env).__name__} is seeded once anyway: leave it out")
     warn_of_statistics(env)
     if isinstance(env, GymVectorEnv):
+        if settings.compile == "on":
+            raise UserError(f"compile='on' records torch simulators, a {type(env).__name__} is none: 'auto' or 'off'")
         return GymnasiumVector(env, seed, first, settings.flatten, settings.info, settings.reset_options)
     env = env if settings.device is None else env.to(settings.device)
-    return Torch(env, seed, first, settings.info)
+    return Torch(env, seed, first, settings.info, cast(Mode, settings.compile))
 
 
 def _one(env: Any, settings: Settings) -> gym.Env:

@@ -13,6 +13,7 @@ from torchrl.data import Categorical, Composite
 
 from pgkit.envs.agents import Names, groups_of, rewards, under
 from pgkit.envs.checks import WRONG, misshapen
+from pgkit.envs.failures import FAILURES, LONGEST, fail, in_episode, warn_of_length
 from pgkit.envs.numpy_entries import flags
 from pgkit.envs.seeding import episode_seed
 from pgkit.envs.spaces import to_env
@@ -90,6 +91,7 @@ class Parallel:
         self._terminated, self._truncated = np.zeros((n, 1), bool), np.zeros((n, 1), bool)
         self._steps, self._result = np.zeros(n, np.int64), self._as_step()
         self.step_count = torch.from_numpy(self._steps)
+        self._warned = False
         self._restart(seed)
 
     def _as_step(self) -> Step:
@@ -112,6 +114,7 @@ class Parallel:
         self._seeded = np.zeros(self.num_envs, bool)
         self._episode = np.full(self.num_envs, -1)
         self._taken: list[list[list[np.ndarray]]] = [[] for _ in self.envs]  # actions of the running episodes
+        self._endless = np.zeros(self.num_envs, bool)  # whose episode is too long to be replayed
 
     def reset(self, seed: int | None = None, rows: Tensor | None = None) -> Entries:
         """As :meth:`pgkit.seams.Simulator.reset`."""
@@ -128,14 +131,17 @@ class Parallel:
         if self.reseed or not self._seeded[i]:
             given["seed"] = episode_seed(self.seed, self.first + i, int(self._episode[i]))
             self._seeded[i] = True
-        result = self.envs[i].reset(**given)
+        try:
+            result = self.envs[i].reset(**given)
+        except FAILURES as error:
+            fail(in_episode(self.envs[i], self.first + i, 0, given.get("seed")), error)
         if not isinstance(result, tuple) or len(result) != 2 or not isinstance(result[0], dict):
             raise UserError(
                 f"{type(self.envs[i]).__name__}.reset returned a {type(result).__name__}: return (observations, "
                 "infos), dicts by the agents' names"
             )
         self._observe("reset", i, result[0], self.envs[i].agents)
-        self._begun[i], self._taken[i] = True, []
+        self._begun[i], self._taken[i], self._endless[i] = True, [], False
 
     def step(self, action: Entries) -> Step:
         """As :meth:`pgkit.seams.Simulator.step`; Box actions are clipped to their bounds first."""
@@ -149,12 +155,21 @@ class Parallel:
             given = [x[i] for x in actions]
             self._one_step(i, given)
             if self.reseed:
-                self._taken[i].append(given)
+                self._keep(i, given)
         for team in self._teams:
             team.fresh.copy_from(team.next)
         for i in np.flatnonzero(self._terminated | self._truncated):
             self._begin(int(i))
         return self._result
+
+    def _keep(self, i: int, actions: list[np.ndarray]) -> None:
+        """Keeps the actions for a resume, unless the episode has become too long."""
+        self._taken[i].append(actions)
+        if len(self._taken[i]) > LONGEST:
+            if not self._warned:
+                self._warned = True
+                warn_of_length(self.envs[i], self.first + i)
+            self._endless[i], self._taken[i] = True, []
 
     def _one_step(self, i: int, actions: list[np.ndarray]) -> None:
         """Steps one environment with the groups' actions ``[A, ...]`` and writes its row."""
@@ -164,7 +179,11 @@ class Parallel:
             for place, name in enumerate(team.members) if name in env.agents
         }  # fmt: skip
         acting = set(given)
-        result = env.step(given)
+        try:
+            result = env.step(given)
+        except FAILURES as error:
+            seed = episode_seed(self.seed, self.first + i, int(self._episode[i]))
+            fail(in_episode(env, self.first + i, int(self._steps[i]) + 1, seed), error)
         if not isinstance(result, tuple) or len(result) != 5:
             raise UserError(
                 f"{type(env).__name__}.step returned no tuple of 5: return (observations, rewards, terminations, "
@@ -201,13 +220,17 @@ class Parallel:
     def state_dict(self) -> dict[str, Any]:
         """Of every environment the number of its episode and the actions since that began, by group."""
         rows = []
-        for episode, taken in zip(self._episode, self._taken, strict=True):
-            columns = zip(*taken, strict=True) if taken else [[] for _ in self._teams]
-            rows.append({"episode": int(episode), "actions": [np.array(list(x)) for x in columns]})
+        for episode, taken, endless in zip(self._episode, self._taken, self._endless, strict=True):
+            columns = zip(*taken, strict=True) if taken and not endless else [[] for _ in self._teams]
+            rows.append({"episode": int(episode) + endless, "actions": [np.array(list(x)) for x in columns]})
         return {"seed": self.seed, "rows": rows}
 
     def load_state_dict(self, state: dict[str, Any]) -> Entries:
         """Restores every environment by replaying the actions of its current episode."""
+        if "rows" not in state:  # they are lost: episodes with a number that none has had
+            self._restart(self.seed)
+            self._episode[:] = state["steps"]
+            return self.reset()
         self._restart(state["seed"])
         if not self.reseed:
             self._episode[:] = [row["episode"] for row in state["rows"]]

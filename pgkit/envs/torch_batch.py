@@ -12,9 +12,12 @@ from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite
 from torchrl.envs import EnvBase, TransformedEnv
 
+from pgkit.compiled import Mode
+from pgkit.envs.failures import FAILURES, fail, in_vector
 from pgkit.envs.numpy_entries import as_path
 from pgkit.envs.seeding import episode_seed
 from pgkit.envs.spaces import ToEnv
+from pgkit.envs.torch_halves import native
 from pgkit.errors import UserError
 from pgkit.seams import Entries, Key, Step
 
@@ -36,11 +39,16 @@ class Torch:
         seed: given to ``env.set_seed``.
         first: index of the first environment, where this is a share of a larger vector.
         info: entries of its observation that a policy does not read; they reach the rollout's ``next`` only.
+        compile: mode of :func:`pgkit.compiled.compiled` for its step and its reset, recorded on a copy of it. A reset
+            has to mind ``_reset`` by masks (``torch.where``); what cannot be recorded runs as it is, and the log says
+            so.
     """
 
     masks = False
 
-    def __init__(self, env: EnvBase, seed: int = 0, first: int = 0, info: Iterable[Key] = ()) -> None:
+    def __init__(
+        self, env: EnvBase, seed: int = 0, first: int = 0, info: Iterable[Key] = (), compile: Mode = "off"
+    ) -> None:
         if len(env.batch_size) > 1:
             raise UserError(
                 f"{type(env).__name__} has the batch size {tuple(env.batch_size)}: flatten it to one dimension"
@@ -71,7 +79,13 @@ class Torch:
         self._bounds = {k: v for k, v in self._bounds.items() if v[0].is_floating_point()}
         bounds = [[x[0].cpu().numpy() for x in pair] for pair in self._bounds.values()]
         self.to_env = ToEnv(*bounds[0], bounds[0][0].dtype) if bounds else ToEnv()
+        self._native = None if compile == "off" else native(env, compile)
         self._restart(seed)
+
+    @property
+    def recorded_parts(self) -> list[str]:
+        """What runs as native code: ``advance``, the step, and ``renew``, the resets."""
+        return [] if self._native is None else self._native[1].names
 
     def _many(self, spec: Composite) -> Composite:
         return spec.clone().unsqueeze(0) if self._one else spec.clone()
@@ -124,10 +138,12 @@ class Torch:
         for key, x in action.items():
             x = x.clamp(*self._bounds[key]) if key in self._bounds else x.clone()
             data.set(key, x.squeeze(0) if self._one else x)
-        done, self._data = self.env.step_and_maybe_reset(data)
+        try:
+            after, self._data = self._advance(data)
+        except FAILURES as error:
+            fail(in_vector(_inner(self.env), self.first, self.num_envs, self._steps + 1, self.seed), error)
         self._untouched = False
         self._steps += 1
-        after = done.get("next")
         reward = self._entries(after, self.reward_spec)
         terminated, truncated = self._flags(after)
         step = Step(
@@ -142,6 +158,18 @@ class Torch:
         }
         self._begun = step.begun()
         return step
+
+    def _advance(self, data: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
+        """What ``step_and_maybe_reset`` gives: the entries below ``next``, and what the next step is made with."""
+        if self._native is None:
+            done, data = self.env.step_and_maybe_reset(data)
+            return done.get("next"), data
+        halves, run = self._native
+        made = run(halves.advance, *[data.get(key) for key in halves.taken])
+        after, fresh = halves.filled(halves.next, made[: len(halves.next)]), made[len(halves.next) :]
+        if any(bool(after.get(key).any()) for key in self.env.done_keys):
+            fresh = run(halves.renew, *fresh)
+        return after, halves.filled(halves.fresh, fresh)
 
     def _entries(self, data: TensorDictBase, spec: Composite) -> Entries:
         found = {_key(key): data.get(key) for key in spec.keys(True, True)}
@@ -181,12 +209,13 @@ class Torch:
 
     def load_state_dict(self, state: dict[str, Any]) -> Entries:
         """Goes on exactly, or begins new episodes with a seed of their own."""
-        seed, begins = self.seed, self.resume == "new episodes" and state["steps"]
+        exact = self.resume == "exact" and "env" in state
+        seed, begins = self.seed, not exact and state["steps"]
         self._restart(episode_seed(seed, self.first, state["steps"]) if begins else seed)
         self.seed, self._steps = seed, state["steps"]
-        for env, own in zip(dict.fromkeys((self.env, _inner(self.env))), state["env"], strict=True):
+        for env, own in zip(dict.fromkeys((self.env, _inner(self.env))), state.get("env", ()), strict="env" in state):
             env.load_state_dict(own)
-        if self.resume == "exact" and state["data"] is not None:
+        if exact and state["data"] is not None:
             self._data = TensorDict(state["data"], batch_size=self.env.batch_size, device=self.env.device)
             self.episode_reward, self.step_count, self._begun = state["counts"]
             return self._entries(self._data, self.observation_spec)

@@ -29,9 +29,12 @@ class VectorEnv(EnvBase):
 
     Attributes:
         groups: of every group of agents, by its path, the dimensions after the environments'.
+        env_timeout, restart_workers: as :func:`~pgkit.envs.make` was told.
     """
 
     env_id: str = "unnamed environment"
+    env_timeout: float | None = None
+    restart_workers: bool = False
 
     def __init__(
         self, make: MakeSimulator, num_envs: int = 1, seed: int = 0, workers: int = 1, splits: bool = True

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import difflib
-from types import TracebackType
+import copy
+from collections.abc import Iterable, Sequence
+from functools import partial
 from typing import Any, Literal
 
 import gymnasium as gym
@@ -12,11 +13,14 @@ import torch
 from torch import Tensor
 from torchrl.data import Composite
 
+from pgkit.compiled import Mode
 from pgkit.envs.agents import Group, Names, groups_of, rewards, under
+from pgkit.envs.failures import FAILURES, fail, in_vector
 from pgkit.envs.numpy_entries import flags
+from pgkit.envs.recorded import Function, Native, Recorded, falls_back, record
 from pgkit.envs.seeding import episode_seed
 from pgkit.envs.spaces import to_env
-from pgkit.envs.vmas_state import Slot, put, slots
+from pgkit.envs.vmas_state import Slot, Stream, make_function, put, slots
 from pgkit.errors import UserError
 from pgkit.seams import Entries, Step
 
@@ -44,6 +48,9 @@ class Vmas:
         device: where they are.
         max_episode_steps: time limit; None: none.
         groups: names of agents by the name of their group; None: one, or by their names where their spaces differ.
+        compile: ``auto`` records step and reset, and compiles what it recorded (a few seconds, kept on disk); what
+            cannot be recorded runs as it is, and the log says why. ``on``: then it is a ``UserError``. ``record``:
+            without a compiler. ``off``: as it is.
         **kwargs: passed to ``vmas.make_env``, which gives what it does not know to the scenario.
 
     Raises:
@@ -60,6 +67,7 @@ class Vmas:
         device: torch.device | str | None = None,
         max_episode_steps: int | None = 100,
         groups: Names | None = None,
+        compile: Mode = "off",
         **kwargs: Any,
     ) -> None:
         if "max_steps" in kwargs:
@@ -69,9 +77,12 @@ class Vmas:
         self.resume: Literal["exact", "new episodes"] = "exact" if known else "new episodes"
         self._steps = 0
         self._make = {"scenario": scenario, "num_envs": num_envs, "device": self.device, **kwargs}
+        self._recorded: dict[str, Recorded] = {}
         self._restart(seed)
         names = [agent.name for agent in self.env.agents]
-        observed = [gym.spaces.Box(-np.inf, np.inf, x.shape[1:], np.float32) for x in self._observed()]
+        with self._stream:
+            shapes = [x.shape[1:] for x in self._observed()]
+        observed = [gym.spaces.Box(-np.inf, np.inf, shape, np.float32) for shape in shapes]
         acted = [_space(space, self.env.continuous_actions) for space in self.env.action_space]
         kind, n = f"vmas/{scenario}" if isinstance(scenario, str) else type(scenario).__name__, num_envs
         spaces = (dict(zip(names, x, strict=True)) for x in (observed, acted))
@@ -87,17 +98,54 @@ class Vmas:
         self.to_env = to_env(self.groups[0].action)
         self._bounds = {g.name: _bounds(g, self.device) for g in self.groups}
         self._begin_counts()
+        if compile != "off":
+            self._recorded = self._twin(groups).recorded(compile, kind)
+        self._begin_native()
+
+    def _twin(self, groups: Names | None) -> Vmas:
+        given = {**self._make, "scenario": copy.deepcopy(self._make["scenario"])}
+        return Vmas(seed=self.seed, max_episode_steps=self.limit, groups=groups, **given)
 
     def _restart(self, seed: int) -> None:
         self.seed = seed
-        make, self._stream = _vmas(self._make["scenario"])
+        make = make_function(self._make["scenario"])
+        try:
+            self.env, self._stream = Stream.of(partial(make, **self._make, seed=seed))
+        except TypeError as error:
+            if "argument" not in str(error):
+                raise
+            raise UserError(f"vmas/{self._make['scenario']} cannot be made with these settings: {error}") from error
+        self._begin_native()
+
+    def recorded(self, mode: Mode, kind: str) -> dict[str, Recorded]:
+        """Step and reset as native code, where they can be recorded; this object is the record's own from then on."""
+        if isinstance(self._make["scenario"], str) and self._make["scenario"] in ELSEWHERE:
+            with falls_back(kind, mode):
+                raise RuntimeError("it keeps some of its state outside of tensors")
+            return {}
+
+        def play(advance: Function, renew: Function) -> None:
+            actions = [self.action_spec[g.name, "action"] for g in self.groups]
+            self.advance(*[spec.rand() for spec in actions])  # makes what VMAS makes at the first step
+            for step in range(40):
+                if step % 8 == 0:
+                    renew(torch.rand(self.num_envs, device=self.device) < (1.0, 0.3)[step > 0])
+                advance(*[spec.rand() for spec in actions])
+
         with self._stream:
-            try:
-                self.env = make(**self._make, seed=seed)
-            except TypeError as error:
-                if "argument" not in str(error):
-                    raise
-                raise UserError(f"vmas/{self._make['scenario']} cannot be made with these settings: {error}") from error
+            return record((self.advance, self.renew), self.held, play, self.num_envs, mode, kind)
+
+    @property
+    def recorded_parts(self) -> list[str]:
+        """What runs as native code: ``advance``, the step, and ``renew``, the resets."""
+        return list(self._recorded)
+
+    def _begin_native(self) -> None:
+        self._stepped = False  # VMAS makes some of its tensors at the first step
+        self._native = Native(self._recorded, self.held, str(self._make["scenario"])) if self._recorded else None
+
+    def _call(self, function: Function, *inputs: Tensor) -> Sequence[Tensor]:
+        return self._native(function, *inputs) if self._native and self._stepped else function(*inputs)
 
     def _begin_counts(self) -> None:
         self.episode_reward: Entries = {
@@ -105,18 +153,51 @@ class Vmas:
         }
         self.step_count = torch.zeros(self.num_envs, dtype=torch.int64, device=self.device)
         self._begun = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
-        self._fresh = self._grouped(self._observed(), "observation")
+        with self._stream:
+            self._fresh = self._named(self.see())
 
     def _observed(self) -> list[Tensor]:
         """Every agent's observation ``[N, *obs]``."""
-        with self._stream:
-            return self.env.get_from_scenario(
-                get_observations=True, get_rewards=False, get_infos=False, get_dones=False
-            )[0]
+        return self.env._get_from_scenario(get_observations=True, get_rewards=False, get_infos=False, get_dones=False)[
+            0
+        ]
 
-    def _grouped(self, agents: list[Tensor], name: str) -> Entries:
+    def see(self) -> list[Tensor]:
+        """The groups' observations ``[N, A, *obs]``."""
+        return list(self._grouped(self._observed(), "observation").values())
+
+    def _grouped(self, agents: Sequence[Tensor], name: str) -> Entries:
         """The agents' tensors ``[N, ...]`` as the groups' ``[N, A, ...]``."""
         return {(group, name): torch.stack([agents[i] for i in own], 1) for group, own in self._places.items()}
+
+    def held(self) -> list[Slot]:
+        """Everything that VMAS's objects hold."""
+        return slots(self.env)
+
+    def advance(self, *actions: Tensor) -> list[Tensor]:
+        """VMAS's own step with the groups' actions ``[N, A, ...]``: their observations, their rewards, and the end.
+
+        It draws from torch's generator.
+        """
+        given: list[Any] = [None] * len(self.env.agents)
+        for x, (group, own) in zip(actions, self._places.items(), strict=True):
+            bounds = self._bounds[group]
+            x = x if bounds is None else x.clamp(*bounds)
+            for i, agent in zip(own, x.unbind(1), strict=True):
+                given[i] = agent.clone()
+        observed, rewarded, terminated, _ = type(self.env).step.__wrapped__(self.env, given)
+        rewards = self._grouped([x.view(-1, 1) for x in rewarded], "reward")
+        return [*self._grouped(observed, "observation").values(), *rewards.values(), terminated]
+
+    def renew(self, rows: Tensor) -> list[Tensor]:
+        """New episodes where ``rows [N]`` is set, all drawn together; the groups' observations."""
+        before = {path: x.clone() for path, _, _, x in self._batched()}
+        self.env._reset(return_observations=False)
+        for slot in self._batched():
+            path, _, _, fresh = slot
+            if path in before:
+                put(slot, torch.where(rows.view(-1, *[1] * (fresh.ndim - 1)), fresh, before[path]))
+        return self.see()
 
     @torch.inference_mode(False)
     @torch.no_grad()
@@ -132,19 +213,18 @@ class Vmas:
 
     def _begin(self, rows: Tensor) -> Entries:
         """New episodes in these rows; what the policy reads next, everywhere."""
-        together = bool(rows.all()) or self.resume == "exact"
-        before = {} if rows.all() or not together else {path: x.clone() for path, _, _, x in self._batched()}
-        with self._stream:
-            if together:
-                self.env.reset(return_observations=False)
-            for i in [] if together else rows.nonzero().flatten().tolist():
-                self.env.reset_at(i, return_observations=False)
-        for slot in self._batched() if before else []:
-            path, _, _, fresh = slot
-            if path in before:
-                put(slot, torch.where(rows.view(-1, *[1] * (fresh.ndim - 1)), fresh, before[path]))
         self._begun = self._begun | rows
-        return self._grouped(self._observed(), "observation")
+        with self._stream:
+            if self.resume == "exact" or bool(rows.all()):
+                found = self._call(self.renew, rows)
+            else:
+                for i in rows.nonzero().flatten().tolist():
+                    self.env._reset_at(i, return_observations=False)
+                found = self._call(self.see)
+        return self._named(found)
+
+    def _named(self, observed: Iterable[Tensor]) -> Entries:
+        return {(g.name, "observation"): x for g, x in zip(self.groups, observed, strict=False)}
 
     def _batched(self) -> list[Slot]:
         """Where the state of the environments lies: tensors ``[N, ...]``."""
@@ -154,17 +234,16 @@ class Vmas:
     @torch.no_grad()
     def step(self, action: Entries) -> Step:
         """As :meth:`pgkit.seams.Simulator.step`; continuous actions are clipped to their bounds first."""
-        actions: list[Any] = [None] * len(self.env.agents)
-        for group, own in self._places.items():
-            x = action[group, "action"]
-            bounds = self._bounds[group]
-            x = x if bounds is None else x.clamp(*bounds)
-            for i, agent in zip(own, x.unbind(1), strict=True):
-                actions[i] = agent.clone()
-        with self._stream:
-            observed, rewarded, terminated, _ = self.env.step(actions)
+        try:
+            with self._stream:
+                made = self._call(self.advance, *[action[g.name, "action"] for g in self.groups])
+        except FAILURES as error:
+            fail(in_vector(self.env.scenario, 0, self.num_envs, self._steps + 1, self.seed), error)
+        self._stepped = True
         self._steps += 1
-        reward = self._grouped([x.view(-1, 1) for x in rewarded], "reward")
+        count = len(self.groups)
+        after, terminated = self._named(made), made[-1]
+        reward = dict(zip(self.episode_reward, made[count:], strict=False))
         goes_on = ~self._begun
         self.step_count = self.step_count * goes_on + 1
         self.episode_reward = {
@@ -172,7 +251,7 @@ class Vmas:
         }
         cut = self.step_count >= self.limit if self.limit is not None else torch.zeros_like(terminated)
         self._begun = torch.zeros_like(cut)
-        after, ended = self._grouped(observed, "observation"), terminated | cut
+        ended = terminated | cut
         self._fresh = self._begin(ended) if ended.any() else after
         ends = ({"terminated": terminated.view(-1, 1)}, {"truncated": cut.view(-1, 1)})
         return Step(after, reward, *ends, {}, self._fresh)
@@ -194,10 +273,10 @@ class Vmas:
     @torch.no_grad()
     def load_state_dict(self, state: dict[str, Any]) -> Entries:
         """Goes on exactly, or begins new episodes with a seed of their own."""
-        begins = self.resume == "new episodes" and state["steps"]
-        self._restart(episode_seed(state["seed"], 0, state["steps"]) if begins else state["seed"])
-        self.seed = state["seed"]
-        if self.resume == "new episodes":
+        exact, seed = self.resume == "exact" and "held" in state, state.get("seed", self.seed)
+        self._restart(seed if exact or not state["steps"] else episode_seed(seed, 0, state["steps"]))
+        self.seed = seed
+        if not exact:
             self._begin_counts()
             self._steps = state["steps"]
             return self._fresh
@@ -211,40 +290,12 @@ class Vmas:
         self._steps = state["steps"]
         self.step_count, self._begun = (state["counts"][name].to(self.device) for name in ("step_count", "begun"))
         self.episode_reward = dict(zip(self.episode_reward, state["returns"], strict=True))
-        self._fresh = self._grouped(self._observed(), "observation")
+        with self._stream:
+            self._fresh = self._named(self.see())
         return self._fresh
 
     def close(self) -> None:
         """Nothing is open: VMAS has no windows unless it is asked to draw."""
-
-
-class _Stream:
-    """``with stream:`` VMAS draws from this object's random numbers; its class has a list with the state for all."""
-
-    def __init__(self, shared: list[Any]) -> None:
-        self._shared, self.state = shared, list(shared)
-
-    def __enter__(self) -> None:
-        self._others = list(self._shared)
-        self._shared[:] = self.state
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None):
-        self.state = list(self._shared)
-        self._shared[:] = self._others
-
-
-def _vmas(scenario: Any) -> tuple[Any, _Stream]:
-    """VMAS's function that makes an environment, and a stream of random numbers."""
-    try:
-        import vmas
-        from vmas.simulator.environment import Environment
-    except ImportError as error:
-        raise UserError(f'vmas/{scenario} needs VMAS ({error}): pip install "pgkit-rl[agents]"') from error
-    known = [*vmas.scenarios, *vmas.debug_scenarios, *vmas.mpe_scenarios]
-    if isinstance(scenario, str) and scenario not in known:
-        nearest = ", ".join(f"vmas/{x}" for x in difflib.get_close_matches(scenario, known, cutoff=0.4) or known)
-        raise UserError(f"unknown environment id 'vmas/{scenario}'; the nearest names are {nearest}")
-    return vmas.make_env, _Stream(Environment.vmas_random_state)
 
 
 def _space(space: Any, continuous: bool) -> gym.Space:

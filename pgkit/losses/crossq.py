@@ -27,6 +27,9 @@ class CrossQLoss(SoftQLoss):
         L_Q &= \frac1B \sum \sum_i (Q_i(s, a) - y)^2 \\
         L_\pi &= \frac1B \sum \alpha \log \pi(\tilde a|s) - \min_i Q_i(s, \tilde a)
 
+    With ``delay_qvalue=True`` the joint pass serves the normalization alone, and :math:`y` comes from delayed critics,
+    which use their running statistics (FlashSAC, 2026, https://arxiv.org/abs/2604.04539).
+
     The critics want batch normalization: ``modules.q_value(env, body=modules.batch_renorm_mlp)``, or torch's or
     TorchRL's layers. In :math:`L_\pi` it uses its running statistics.
 
@@ -35,7 +38,8 @@ class CrossQLoss(SoftQLoss):
     Args:
         actor_network: as in :class:`~pgkit.losses.SACLoss`.
         qvalue_network: likewise.
-        settings: the other settings of :class:`~pgkit.losses.SoftQLoss`, but ``delay_qvalue`` and ``delay_actor``.
+        settings: the other settings of :class:`~pgkit.losses.SoftQLoss`, but ``delay_actor``; ``delay_qvalue`` is
+            off by default.
 
     Writes what ``SACLoss`` writes.
     """
@@ -43,7 +47,8 @@ class CrossQLoss(SoftQLoss):
     def __init__(
         self, actor_network: TensorDictModule, qvalue_network: Critics, **settings: Unpack[SoftSettings]
     ) -> None:
-        super().__init__(actor_network, qvalue_network, delay_actor=False, delay_qvalue=False, **settings)
+        settings.setdefault("delay_qvalue", False)
+        super().__init__(actor_network, qvalue_network, delay_actor=False, **settings)
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -59,6 +64,8 @@ class CrossQLoss(SoftQLoss):
 
         with torch.no_grad():
             members = self.draw()
+            if self.delay_qvalue:
+                next_outputs = self.outputs(batch["next"], next_action, self.target_qvalue_network_params)
             min_q = self.head.least(next_outputs if members is None else next_outputs[..., members, :])
             target = self.target(batch, min_q - alpha * next_log_prob)
         loss_qvalue, q = self.regress(batch, outputs, target)

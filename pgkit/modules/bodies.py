@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
+from math import inf
 
 import torch
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
-from pgkit.modules.ensemble import EnsembleBatchRenorm, EnsembleDropout, EnsembleLayerNorm, EnsembleLinear
+from pgkit.modules.ensemble import (
+    EnsembleBatchRenorm,
+    EnsembleDropout,
+    EnsembleLayerNorm,
+    EnsembleLinear,
+    EnsembleRMSNorm,
+)
 from pgkit.modules.groups import agents
 from pgkit.modules.sizes import flat_size, layer_sizes
 
@@ -92,6 +100,38 @@ class ResidualBlock(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         return x + self.outer(torch.relu(self.inner(self.norm(x))))
+
+
+def flash(num: int, features: int, width: int = 256, blocks: int = 2, expansion: int = 4) -> Layers:
+    """A residual encoder with batch normalization: norm, linear, ``blocks`` residual blocks, RMS norm.
+
+    FlashSAC (2026, https://arxiv.org/abs/2604.04539). Its linear layers have no biases, and its weights are to stay on
+    a sphere: :class:`~pgkit.modules.WeightProjection`. The input's batch norm stands in place of an ``ObsNormalizer``.
+
+    Args:
+        num, features, width, blocks, expansion: as in :func:`simba`.
+    """
+    layers: list[nn.Module] = [_batch_norm(num, features), EnsembleLinear(num, features, width, gain=1.0, bias=False)]
+    layers += [BatchNormBlock(num, width, expansion * width) for _ in range(blocks)]
+    return [*layers, EnsembleRMSNorm(num, width)], width
+
+
+class BatchNormBlock(nn.Module):
+    """``x + relu(norm(linear(relu(norm(linear(x))))))``, ``[num, B, width]`` to the same."""
+
+    def __init__(self, num: int, width: int, hidden: int) -> None:
+        super().__init__()
+        self.inner = EnsembleLinear(num, width, hidden, gain=1.0, bias=False)
+        self.inner_norm = _batch_norm(num, hidden)
+        self.outer = EnsembleLinear(num, hidden, width, gain=1.0, bias=False)
+        self.outer_norm = _batch_norm(num, width)
+
+    def forward(self, x: Tensor) -> Tensor:
+        hidden = torch.relu(self.inner_norm(self.inner(x)))
+        return x + torch.relu(self.outer_norm(self.outer(hidden)))
+
+
+_batch_norm = partial(EnsembleBatchRenorm, eps=1e-5, warmup=inf)
 
 
 class Encoder(nn.Module):

@@ -16,15 +16,18 @@ class EnsembleLinear(nn.Module):
     The bias is added apart, where a compiler adds it in the activation's kernel: ``baddbmm`` copies it out first.
     """
 
-    def __init__(self, num: int, in_features: int, out_features: int, gain: float) -> None:
+    bias: nn.Parameter | None
+
+    def __init__(self, num: int, in_features: int, out_features: int, gain: float, bias: bool = True) -> None:
         super().__init__()
         self.weight = nn.Parameter(torch.empty(num, in_features, out_features))
-        self.bias = nn.Parameter(torch.zeros(num, 1, out_features))
+        self.bias = nn.Parameter(torch.zeros(num, 1, out_features)) if bias else None
         for member in self.weight.data:
             nn.init.orthogonal_(member, gain)
 
     def forward(self, x: Tensor) -> Tensor:
-        return torch.bmm(x, self.weight) + self.bias
+        out = torch.bmm(x, self.weight)
+        return out if self.bias is None else out + self.bias
 
 
 class EnsembleLayerNorm(nn.Module):
@@ -37,6 +40,21 @@ class EnsembleLayerNorm(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         return torch.addcmul(self.bias, F.layer_norm(x, x.shape[-1:]), self.weight)
+
+
+class EnsembleRMSNorm(nn.Module):
+    r"""``num`` RMS norms (Zhang & Sennrich, 2019, https://arxiv.org/abs/1910.07467): ``[num, B, features]`` to same.
+
+    .. math:: y = w x \Big/ \sqrt{\textstyle\frac1d \sum_i x_i^2 + \epsilon}
+    """
+
+    def __init__(self, num: int, features: int, eps: float = 1e-6) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.ones(num, 1, features))
+        self.eps = eps
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x * (x.square().mean(-1, keepdim=True) + self.eps).rsqrt() * self.weight
 
 
 class EnsembleDropout(nn.Dropout):
@@ -80,7 +98,7 @@ class EnsembleBatchRenorm(nn.Module):
         momentum: share of the batch's statistics that the running ones take over.
         eps: added to variances.
         r_max, d_max: bounds of the correction.
-        warmup: steps before it begins.
+        warmup: steps before it begins; ``inf`` is plain batch normalization for good.
     """
 
     mean: Tensor
@@ -96,7 +114,7 @@ class EnsembleBatchRenorm(nn.Module):
         eps: float = 1e-3,
         r_max: float = 3.0,
         d_max: float = 5.0,
-        warmup: int = 100_000,
+        warmup: float = 100_000,
     ) -> None:
         super().__init__()
         self.weight = nn.Parameter(torch.ones(num, 1, features))

@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
@@ -46,6 +46,34 @@ class GaussianExploration(TensorDictModuleBase):
             action = out[self.bounds.key]
             out[self.bounds.key] = self.bounds(action, self.std * torch.randn_like(action))
         return out
+
+
+class ScaledExploration(TensorDictModuleBase):
+    r"""A Gaussian actor that draws with :math:`f` times its deviation, for one of several explorers.
+
+    With :math:`f_i = f_0^{1 - i/(N-1)} f_1^{i/(N-1)}` for explorer :math:`i` of :math:`N` they form a ladder, as the
+    :math:`\epsilon` of Ape-X do (Horgan et al., 2018, https://arxiv.org/abs/1803.00933). A squashed Gaussian is scaled
+    before the tanh. Without exploration, as in evaluation, the action is the actor's own.
+
+    Args:
+        actor: writes ``scale`` and draws from it; :func:`~pgkit.modules.tanh_normal_actor`.
+        factor: :math:`f`.
+    """
+
+    def __init__(self, actor: ProbabilisticTensorDictSequential, factor: float = 1.0) -> None:
+        super().__init__()
+        self.actor, self.factor = actor, factor
+        self.in_keys, self.out_keys = list(actor.in_keys), list(actor.out_keys)
+        self.key = next(key for key in actor[-1].in_keys if (key if isinstance(key, str) else key[-1]) == "scale")
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """The actor's result, drawn with the larger or smaller deviation."""
+        *network, draw = self.actor
+        for module in network:
+            tensordict = module(tensordict)
+        if explores():
+            tensordict[self.key] = self.factor * tensordict[self.key]
+        return draw(tensordict)
 
 
 class OrnsteinUhlenbeck(TensorDictModuleBase):
@@ -96,6 +124,53 @@ class OrnsteinUhlenbeck(TensorDictModuleBase):
             noise = (1 - self.theta) * before.masked_fill(begins, 0.0) + self.std * torch.randn_like(before)
             out[self.bounds.key] = self.bounds(out[self.bounds.key], noise)
             out[self._next_key] = noise
+        return out
+
+
+class NoiseRepeat(TensorDictModuleBase):
+    r"""A squashed Gaussian actor whose noise stays the same for a random number of steps.
+
+    .. math:: a = \tanh(\mu(s) + \sigma(s) \epsilon), \qquad P(n) \propto n^{-\zeta}, \quad n = 1, \dots, n_{max}
+
+    with :math:`\epsilon \sim N(0, 1)` drawn anew every :math:`n` steps, and :math:`n` with it: long pushes in one
+    direction explore further than trembling (FlashSAC, 2026, https://arxiv.org/abs/2604.04539). An episode begins with
+    new noise. Without exploration, as in evaluation, the action is the actor's own.
+
+    The noise and the steps left are carried from step to step, as by :class:`OrnsteinUhlenbeck`.
+
+    Args:
+        actor: :func:`~pgkit.modules.tanh_normal_actor`, which writes ``loc`` and ``scale``.
+        env: the bounds come from its specs.
+        zeta: :math:`\zeta`.
+        longest: :math:`n_{max}`; 1 draws anew at every step.
+    """
+
+    shares: Tensor
+
+    def __init__(self, actor: TensorDictModuleBase, env: EnvBase, zeta: float = 2.0, longest: int = 16) -> None:
+        super().__init__()
+        self.actor, self.bounds = actor, ActionBounds(env)
+        self.state_shape = (self.bounds.shape[-1] + 1,)  # the noise, and the steps that it has left
+        self.state_key: NestedKey = (*self.bounds.group, "recurrent_state")
+        self._next_key: NestedKey = ("next", *self.state_key)
+        self.in_keys = [*actor.in_keys, "is_init", self.state_key]
+        self.out_keys = [self.bounds.key, self._next_key]
+        weights = torch.arange(1, longest + 1, dtype=torch.float64) ** -zeta
+        self.register_buffer("shares", (weights.cumsum(0) / weights.sum()).float().to(self.bounds.low.device))
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """The actor's ``action``, of kept noise, and the state of the noise."""
+        out = self.actor(tensordict)
+        if explores():
+            noise, left = tensordict[self.state_key].split([self.state_shape[0] - 1, 1], -1)
+            drawn = 1 + (torch.rand_like(left) > self.shares).sum(-1, keepdim=True)
+            anew = tensordict["is_init"] | (left < 0.5)
+            noise = torch.where(anew, torch.randn_like(noise), noise)
+            left = torch.where(anew, drawn, left)
+            squashed = (out["loc"] + out["scale"] * noise).tanh()
+            middle = (self.bounds.low + self.bounds.high) / 2
+            out[self.bounds.key] = self.bounds(middle, squashed)
+            out[self._next_key] = torch.cat([noise, left - 1], -1)
         return out
 
 

@@ -132,6 +132,7 @@ class AgentLinear(EnsembleLinear):
         self.sets = None if list(sets) == [*range(len(sets))] else list(sets)
 
     def forward(self, x: Tensor) -> Tensor:
+        assert self.bias is not None
         own = [p if self.sets is None else torch.stack([p[i] for i in self.sets]) for p in (self.weight, self.bias)]
         first = x.movedim(-2, 0)  # a layer after another finds it contiguous
         out = torch.bmm(first.reshape(len(first), -1, x.shape[-1]), own[0]) + own[1]

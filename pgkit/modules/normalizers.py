@@ -7,6 +7,7 @@ from math import floor
 from typing import Any
 
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from pgkit.errors import UserError
@@ -179,3 +180,55 @@ class ReturnScale(RunningMoments):
                 factor = factor.reshape(-1, 1, 1)
             for parameter in head.parameters():
                 parameter.mul_(factor)
+
+
+class RewardScale(nn.Module):
+    r"""Divides rewards so that discounted returns have a deviation of 1 at most and never leave ``[-g_max, g_max]``.
+
+    .. math:: r \leftarrow \frac{r}{\max(\sigma_G, \max |G| / g_{max})}, \qquad G_t = r_t + \gamma\, G_{t-1}
+
+    with :math:`G` beginning anew with every episode, as in SimbaV2 (Lee et al., 2025, https://arxiv.org/abs/2502.15280)
+    and FlashSAC (https://arxiv.org/abs/2604.04539). A categorical critic can then have fixed bins. Rewards are stored
+    as they are and divided when they are drawn, by the scale of then: give it to
+    :class:`pgkit.updates.OffPolicyUpdate` (``augment=``), and call :meth:`update` once a rollout.
+
+    Args:
+        num_envs: environments of a rollout.
+        gamma: the loss's discount.
+        g_max: bound of the returns.
+        device: where it lives.
+    """
+
+    returns: Tensor
+    largest: Tensor
+
+    def __init__(
+        self, num_envs: int, gamma: float = 0.99, g_max: float = 5.0, *, device: torch.device | str | None = None
+    ) -> None:
+        super().__init__()
+        self.gamma, self.g_max, self.moments = gamma, g_max, RunningMoments((), device)
+        self.register_buffer("returns", torch.zeros(num_envs, device=device))  # of the episodes that run now
+        self.register_buffer("largest", torch.zeros((), device=device))
+
+    @property
+    def scale(self) -> Tensor:
+        """What rewards are divided by, a scalar."""
+        return torch.maximum((self.moments.var + 1e-8).sqrt(), self.largest / self.g_max)
+
+    def forward(self, batch: TensorDictBase) -> TensorDictBase:
+        """A batch with divided rewards; the one that is given stays."""
+        out = batch.copy()
+        out["next", "reward"] = batch["next", "reward"] / self.scale
+        return out
+
+    @torch.no_grad()
+    def update(self, rollout: TensorDictBase) -> None:
+        """Takes in a rollout ``[num_envs, T]``."""
+        rewards, done = (rollout["next", name].squeeze(-1).unbind(1) for name in ("reward", "done"))
+        seen = []
+        for reward, ended in zip(rewards, done, strict=True):
+            seen.append(reward + self.gamma * self.returns)
+            self.returns.copy_(seen[-1] * ~ended)
+        returns = torch.stack(seen)
+        self.moments.update(returns)
+        self.largest.copy_(torch.maximum(self.largest, returns.abs().amax()))

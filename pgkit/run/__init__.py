@@ -5,6 +5,7 @@ from pgkit.run.args import RunArgs, placed, setting
 from pgkit.run.evaluate import evaluate, play
 from pgkit.run.export import export, push_to_hub
 from pgkit.run.load import load_policy
+from pgkit.run.on_ray import RayArgs, collector
 from pgkit.run.plots import plot
 from pgkit.run.policy import Policy
 from pgkit.run.run import Run
@@ -13,8 +14,10 @@ from pgkit.run.settings import launch
 __all__ = [
     "Agent",
     "Policy",
+    "RayArgs",
     "Run",
     "RunArgs",
+    "collector",
     "evaluate",
     "export",
     "launch",

@@ -64,6 +64,10 @@ class RunArgs:
     """Envs stepped side by side."""
     workers: int = setting(1, low=1, high=1024, on_resume=True)
     """Processes that the envs are spread over; the numbers stay the same."""
+    env_timeout: float | None = setting(None, above=0, high=10**6, on_resume=True)
+    """Seconds that a step of the environments may take; longer, and the run ends, or the worker is replaced."""
+    restart_workers: bool = setting(False, on_resume=True)
+    """Replace worker processes that end; their environments go on where they were, or begin new episodes."""
     device: Literal["auto", "cpu", "cuda"] = setting("auto", on_resume=True)
     """Where the networks are trained; auto: on the GPU where there is one."""
     run_dir: Path | None = None
@@ -86,8 +90,8 @@ class RunArgs:
     """Go on with --run-dir where it has a checkpoint, else begin there: one command for a run that is stopped."""
     trust: bool = setting(False, on_resume=True)
     """Import the modules that a run directory names: its environment's and its wrapper's."""
-    threads: int = setting(1, low=1, high=256, on_resume=True)
-    """Threads that PyTorch uses in this process; 1 is fastest for small networks."""
+    threads: int = setting(1, low=0, high=256, on_resume=True)
+    """Threads that PyTorch uses in this process; 1 is fastest for small networks; 0: 1 or 2, measured at the start."""
     explain: bool = setting(False, on_resume=True)
     """Print how the agent is wired (who writes and who reads each entry), and end before training."""
 
@@ -101,6 +105,7 @@ class RunArgs:
             make = partial(made_here, self.env_id, self.wrapper, modules, here, **inside)
             vars(make)["__qualname__"] = self.env_id  # the name that messages and the replay use
         keywords |= {"num_envs": num_envs, "seed": seed, "workers": workers, "action_repeat": self.action_repeat}
+        keywords |= {"env_timeout": self.env_timeout, "restart_workers": self.restart_workers}
         return envs.make(make, **keywords)
 
     def imports(self) -> list[str]:

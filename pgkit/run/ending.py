@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shlex
 from collections.abc import Mapping
 from pathlib import Path
@@ -38,6 +39,14 @@ def write_summary(
         "best/frames": best.get("frames", 0),
     }
     write_json(run_dir / "summary.json", summary, hashed=False)
+
+
+def has_ended(run_dir: Path, frames: int) -> bool:
+    """Whether the last evaluation is made, and the summary written, of a run that has come to so many frames."""
+    try:
+        return json.loads((run_dir / "summary.json").read_text())["frames"] == frames
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
 
 
 def how_to_go_on(run_dir: Path, args: RunArgs, recipe: str, frames: int, best: bool) -> str:

@@ -22,7 +22,7 @@ from pgkit.run.seeding import preserved_rng
 from pgkit.seams import Entries, Key
 
 RECORDED_AT, MOST_RECORDS = 20, 8  # calls of one layout before it is recorded, which takes 0.1 s; layouts
-LONG_EPISODE = 100_000  # steps; longer than those of Gymnasium, dm_control and Atari
+LONGEST = 100_000  # steps of an episode; longer than those of Gymnasium, dm_control and Atari
 
 
 @contextmanager
@@ -120,7 +120,9 @@ def act(policy: torch.nn.Module, obs: np.ndarray, deterministic: bool = True) ->
     return Acting(policy)({"observation": torch.as_tensor(obs)}, begun, deterministic)["action"].cpu().numpy()
 
 
-def play(policy: Any, env: Any, episodes: int, deterministic: bool = True) -> tuple[np.ndarray, np.ndarray]:
+def play(
+    policy: Any, env: Any, episodes: int, deterministic: bool = True, longest: int = LONGEST
+) -> tuple[np.ndarray, np.ndarray]:
     """Returns and lengths of ``episodes`` whole episodes, each ``[episodes]``, ordered by env slot.
 
     Every one of the env's N slots plays its own share (``episodes / N``) to the end: to take whichever
@@ -131,8 +133,9 @@ def play(policy: Any, env: Any, episodes: int, deterministic: bool = True) -> tu
         policy: a TensorDict actor, or what ``load_policy`` gives.
         env: from ``envs.make``, or any TorchRL environment that it takes.
         deterministic: the likeliest actions, or draws.
+        longest: an episode ends after so many steps, counts as it is, and a warning says so.
     """
-    check_whole_number(1, episodes=episodes)
+    check_whole_number(1, episodes=episodes, longest=longest)
     env = vector_of(env)
     policy = policy if isinstance(policy, torch.nn.Module) else policy.actor
     with preserved_rng(), in_evaluation(policy), _one_thread():
@@ -145,23 +148,27 @@ def play(policy: Any, env: Any, episodes: int, deterministic: bool = True) -> tu
             actions = {key: x.to(simulator.device) for key, x in act(fresh, begun, deterministic).items()}
             step = simulator.step(actions)
             ended, begun, fresh = step.ended(), step.begun().clone(), step.fresh
-            _warn_of_length(simulator.step_count[~ended])
+            endless = ~ended & (simulator.step_count >= longest)
+            if endless.any():
+                _warn_of_length(longest)
+            ended = ended | endless
             if ended.any():
                 totals = [x.flatten(1).double() for x in simulator.episode_reward.values()]
                 returns = torch.cat(totals, 1).mean(1)
                 for slot in ended.nonzero().flatten().tolist():
                     if len(finished[slot]) < share[slot]:
                         finished[slot].append((float(returns[slot]), int(simulator.step_count[slot])))
+            if endless.any():
+                fresh, begun = simulator.reset(rows=endless), begun | endless
     flat = [episode for slot in finished for episode in slot]
     return np.array([reward for reward, _ in flat]), np.array([length for _, length in flat])
 
 
-def _warn_of_length(lengths: Tensor) -> None:
-    if (lengths == LONG_EPISODE).any():
-        getLogger("pgkit").warning(
-            "an episode of evaluation has come to %s steps and goes on: does the environment end? "
-            "envs.make(id, max_episode_steps=...) sets a time limit", f"{LONG_EPISODE:,}",
-        )  # fmt: skip
+def _warn_of_length(longest: int) -> None:
+    getLogger("pgkit").warning(
+        "an episode of evaluation was ended at %s steps and counts as it is: does the environment end? "
+        "envs.make(id, max_episode_steps=...) sets a time limit", f"{longest:,}",
+    )  # fmt: skip
 
 
 def evaluate(policy: Any, env: Any, episodes: int, deterministic: bool = True) -> dict[str, float]:

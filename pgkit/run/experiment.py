@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import hashlib
 import itertools
 import json
 import re
@@ -41,7 +42,9 @@ class Cell:
 
     @property
     def directory(self) -> Path:
-        return self.folder / f"{re.sub(r'[^A-Za-z0-9._-]+', '-', self.env)}__{self.seed}"
+        """Of its own: other flags, another directory."""
+        parts = (self.env, shlex.join(self.flags), str(self.seed))
+        return self.folder / "__".join(_file_name(part) for part in parts if part)
 
     @property
     def done(self) -> bool:
@@ -49,7 +52,7 @@ class Cell:
 
     @property
     def log(self) -> Path:
-        return self.directory.with_suffix(".log")
+        return self.directory.with_name(f"{self.directory.name}.log")
 
     @property
     def command(self) -> list[str]:
@@ -67,6 +70,12 @@ class Cell:
         """The last line that a failed run printed."""
         lines = self.log.read_text(errors="replace").strip().splitlines()
         return lines[-1] if lines else "it printed nothing"
+
+
+def _file_name(text: str) -> str:
+    """Text as part of a file name; long text ends in a digest."""
+    plain = re.sub(r"[^A-Za-z0-9._-]+", "-", text).strip("-")
+    return plain if len(plain) <= 60 else f"{plain[:50]}-{hashlib.sha256(text.encode()).hexdigest()[:8]}"
 
 
 def cells(recipe: str, envs: Sequence[str], seeds: Sequence[int], flags: Sequence[str], folder: Path) -> list[Cell]:

@@ -8,7 +8,9 @@ from typing import Any
 
 import numpy as np
 import torch
+from torchrl.data import Bounded
 
+from pgkit.envs.spaces import ToEnv
 from pgkit.errors import UserError
 from pgkit.run.args import RunArgs
 from pgkit.run.evaluate import Acting
@@ -19,7 +21,8 @@ from pgkit.seams import Key, Memory
 class Policy:
     """A policy with its observation normalizer, and the env it was trained for.
 
-    ``to_env`` makes of the policy's actions what the environment takes, as in training; None leaves them.
+    ``to_env`` makes of the policy's actions what the environment takes, as in training; None leaves them. Of several
+    groups of agents it does so for the first, and ``others`` have the further groups' by the keys of their actions.
     ``observation_shape`` is a mapping from names to shapes where the policy reads the entries of a Dict;
     ``observation_dtype`` names their types where they are not float32.
     """
@@ -31,9 +34,10 @@ class Policy:
     frames: int = 0
     observation_dtype: dict[Any, str] = field(default_factory=dict)
     args: RunArgs | None = None
+    others: dict[Any, Callable[[np.ndarray], np.ndarray]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self._acting = Acting(self.actor, (self.action_key,))
+        self._acting = Acting(self.actor, (self.action_key, *self.others))
         self._begins, self._recurrent = True, self.memory is not None
 
     @classmethod
@@ -69,11 +73,14 @@ class Policy:
         """An episode begins at the next :meth:`predict`: a recurrent policy forgets. No other needs it."""
         self._acting.state, self._begins = None, True
 
-    def predict(self, obs: Any, deterministic: bool = True, episode_start: Any = None) -> np.ndarray:
+    def predict(self, obs: Any, deterministic: bool = True, episode_start: Any = None) -> Any:
         """Action for one observation ``[*obs]``, or actions ``[N, *action]`` for a batch ``[N, *obs]``.
 
-        Where the policy reads the entries of a Dict, ``obs`` is a mapping from their names to arrays. The actions are
-        what the environment takes: continuous ones are clipped to its bounds.
+        Where the policy reads the entries of a Dict, ``obs`` is a mapping from their names to arrays. A group of agents
+        has a dimension more: ``[agents, *obs]`` or ``[N, agents, *obs]``, and actions ``[agents, *action]``. Of several
+        groups ``obs`` is a mapping from their names, and so is the result; what has further entries beside the
+        observation, an action mask, is a mapping in it. The actions are what the environment takes: continuous ones
+        are clipped to its bounds.
 
         Args:
             obs: numbers; a wrong shape is a UserError.
@@ -85,17 +92,20 @@ class Policy:
             UserError: wrong shapes; or a recurrent policy is given other rows in the middle of their episodes.
         """
         entries, single = self._entries(obs)
-        rows = len(next(iter(entries.values())))
-        begun = self._begun(rows, episode_start)
-        action = self._acting(entries, begun, deterministic)[self.action_key].cpu().numpy()
+        begun = self._begun(len(next(iter(entries.values()))), episode_start)
+        actions = {key: x.cpu().numpy() for key, x in self._acting(entries, begun, deterministic).items()}
         self._begins = False
-        action = action if self.to_env is None else self.to_env(action)
-        return action[0] if single else action
+        first, converters = self.action_key, dict(self.others)
+        if self.to_env is not None:
+            converters[first] = self.to_env
+        actions = {key: converters[key](x) if key in converters else x for key, x in actions.items()}
+        actions = {key: x[0] if single else x for key, x in actions.items()}
+        return {key[0]: x for key, x in actions.items()} if self.others else actions[first]
 
     def _entries(self, obs: Any) -> tuple[dict[Key, torch.Tensor], bool]:
         """What the actor reads as a batch, and whether it was a single observation."""
-        given = obs if isinstance(obs, Mapping) else {"observation": obs}
-        entries, single, shapes = {}, False, self.shapes
+        given, shapes = self._by_key(obs), self.shapes
+        entries, single = {}, False
         for name, shape in shapes.items():
             if name not in given:
                 had, reads = (", ".join(map(dotted, keys)) for keys in (given, shapes))
@@ -126,10 +136,34 @@ class Policy:
             )
         return begun
 
+    def _by_key(self, obs: Any) -> dict[Key, Any]:
+        """The arrays given, by the keys that the policy reads them from."""
+        group = None if isinstance(self.action_key, str) else self.action_key[:-1]
+        if not isinstance(obs, Mapping):
+            return {"observation" if group is None else (*group, "observation"): obs}
+        flat: dict[Key, Any] = {}
+        for name, x in obs.items():
+            path = name if isinstance(name, tuple) else (name,)
+            if isinstance(x, Mapping):
+                flat |= {(*path, inner): value for inner, value in x.items()}
+            elif group is not None and len(path) == 1:
+                named = any((*path, "observation") == key for key in self.shapes)  # a group's name, or an entry's
+                flat[(*path, "observation") if named else (*group, *path)] = x
+            else:
+                flat[name] = x
+        return flat
+
 
 def dotted(key: Key) -> str:
     """A nested key as one name: ``agents.observation``."""
     return key if isinstance(key, str) else ".".join(key)
+
+
+def _converter(spec: Any) -> ToEnv:
+    """What makes the environment's of a further group's actions."""
+    if not isinstance(spec, Bounded):
+        return ToEnv()
+    return ToEnv(spec.low.cpu().numpy(), spec.high.cpu().numpy(), np.dtype(np.float32))
 
 
 def describe_env(env: Any) -> dict[str, Any]:
@@ -140,5 +174,6 @@ def describe_env(env: Any) -> dict[str, Any]:
     return {
         "observation_shape": shapes["observation"] if list(shapes) == ["observation"] else shapes,
         "to_env": env.to_env,
+        "others": {key: _converter(env.full_action_spec_unbatched[key]) for key in env.action_keys[1:]},
         "observation_dtype": {name: dtype for name, dtype in dtypes.items() if dtype != "float32"},
     }

@@ -15,15 +15,29 @@ from pgkit.run.plots import short_count
 
 Group = tuple[str, str]
 """Recipe and settings: what a line of a report is about."""
+MARKS = ("<!-- report -->", "<!-- end of report -->")
+PUBLISHED = ("recipe", "env", "settings", "score", "source")
 
 
-def report(tables: Sequence[Path], out: Path, x: str = "frames") -> str:
+def report(
+    tables: Sequence[Path],
+    out: Path,
+    x: str = "frames",
+    *,
+    published: Path | None = None,
+    reach: Sequence[float] = (),
+) -> str:
     """Markdown about results tables, written to ``out``; figures go beside it.
+
+    A file that has the two lines of :data:`MARKS` keeps what stands before and after them.
 
     Args:
         tables: CSV files that ``pgkit experiment`` wrote.
         out: a ``.md`` file. Figures are ``<stem>-curves.png`` and ``<stem>-profiles.png``.
         x: ``frames`` or ``minutes``, the axis of the learning curves.
+        published: a CSV file of others' scores, with the columns :data:`PUBLISHED`, to stand beside those of the same
+            environment, recipe and settings.
+        reach: scores for a table of the frames and minutes that runs take to them.
 
     Raises:
         UserError: a table is missing, damaged or empty.
@@ -31,7 +45,9 @@ def report(tables: Sequence[Path], out: Path, x: str = "frames") -> str:
     rows = [row for table in tables for row in _present(table)]
     curves = [r for t in tables for r in experiment.read(t.with_name(f"{t.stem}-curves.csv"), experiment.CURVE)]
     scores = by_task(rows)
-    parts = ["# Results", *markdown(scores, rows)]
+    parts = markdown(scores, rows, others(published))
+    if reach:
+        parts.append(time_to_score(curves, reach))
     out.parent.mkdir(parents=True, exist_ok=True)
     if curves:
         _draw_curves(curves, out.with_name(f"{out.stem}-curves.png"), x)
@@ -44,8 +60,25 @@ def report(tables: Sequence[Path], out: Path, x: str = "frames") -> str:
             f"![Performance profiles]({out.stem}-profiles.png)\n\n*Share of runs above a share of the best score.*"
         )
     text = "\n\n".join(parts) + "\n"
+    old = out.read_text(encoding="utf-8") if out.is_file() else ""
+    if all(mark in old for mark in MARKS):
+        text = f"{old.partition(MARKS[0])[0]}{MARKS[0]}\n\n{text}\n{MARKS[1]}{old.partition(MARKS[1])[2]}"
+    else:
+        text = f"# Results\n\n{text}"
     out.write_text(text, encoding="utf-8")
     return text
+
+
+def others(published: Path | None) -> dict[tuple[str, Group], str]:
+    """What others report, by environment and group."""
+    if published is None:
+        return {}
+    if not published.is_file():
+        raise UserError(f"--published {published}: there is no such file")
+    found: dict[tuple[str, Group], list[str]] = defaultdict(list)
+    for row in experiment.read(published, PUBLISHED):
+        found[row["env"], (row["recipe"], row["settings"])].append(f"{row['score']} ({row['source']})")
+    return {key: "; ".join(scores) for key, scores in found.items()}
 
 
 def _present(table: Path) -> list[dict[str, str]]:
@@ -71,10 +104,15 @@ def by_task(rows: Sequence[Mapping[str, str]]) -> dict[tuple[str, Group], list[f
     return dict(scores)
 
 
-def markdown(scores: Mapping[tuple[str, Group], list[float]], rows: Sequence[Mapping[str, str]]) -> list[str]:
+def markdown(
+    scores: Mapping[tuple[str, Group], list[float]],
+    rows: Sequence[Mapping[str, str]],
+    published: Mapping[tuple[str, Group], str],
+) -> list[str]:
     """The tables: each environment's interquartile mean, and the probability that one group improves on another."""
-    lines = ["| env | recipe | settings | seeds | mean | interquartile mean (95% interval) | minutes | frames/s |",
-             "|---|---|---|---|---|---|---|---|"]  # fmt: skip
+    heads = ["env", "recipe", "settings", "seeds", "mean", "interquartile mean (95% interval)", "minutes", "frames/s"]
+    heads += ["published"] if published else []
+    lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
     for (env, (recipe, settings)), values in scores.items():
         own = [r for r in rows if (r["env"], r["recipe"], r["settings"]) == (env, recipe, settings)]
         estimate = statistics.interval(statistics.iqm, [values])
@@ -82,6 +120,7 @@ def markdown(scores: Mapping[tuple[str, Group], list[float]], rows: Sequence[Map
         lines.append(
             f"| {env} | {recipe} | {settings and f'`{settings}`'} | {len(values)} | {np.mean(values):,.1f} "
             f"| {estimate} | {minutes:.1f} | {fps:,.0f} |"
+            + (f" {published.get((env, (recipe, settings)), '')} |" if published else "")
         )
     return ["\n".join(lines), *_improvements(scores)]
 
@@ -98,6 +137,28 @@ def _improvements(scores: Mapping[tuple[str, Group], list[float]]) -> list[str]:
                 x, y = ([scores[env, group] for env in envs] for group in (first, second))
                 lines.append(f"| {name(first)} | {name(second)} | {len(envs)} | {statistics.improvement(x, y)} |")
     return ["\n".join(lines)] if len(lines) > 2 else []
+
+
+def time_to_score(curves: Sequence[Mapping[str, str]], reach: Sequence[float]) -> str:
+    """A table of the first evaluation at or above each score: medians over seeds of its frames and minutes.
+
+    A seed that never gets there counts as the last of all; where half of them do not, there is no median.
+    """
+    runs: dict[tuple[str, Group, str], list[tuple[float, float, float]]] = defaultdict(list)
+    for r in curves:
+        point = (float(r["frames"]), float(r["minutes"]), float(r["eval_mean"]))
+        runs[r["env"], (r["recipe"], r["settings"]), r["seed"]].append(point)
+    lines = ["| env | recipe | score | seeds that reach it | frames | minutes |", "|---|---|---|---|---|---|"]
+    never = (np.inf, np.inf, 0.0)
+    for env, group in dict.fromkeys((env, group) for env, group, _ in runs):
+        own = [sorted(points) for key, points in runs.items() if key[:2] == (env, group)]
+        for score in reach:
+            first = [next((point for point in points if point[2] >= score), never) for points in own]
+            frames, minutes, _ = np.median(np.array(first), 0)
+            shown = f"{frames:,.0f} | {minutes:.1f}" if np.isfinite(frames) else "- | -"
+            reached = sum(np.isfinite(point[0]) for point in first)
+            lines.append(f"| {env} | {name(group)} | {score:,g} | {reached} of {len(own)} | {shown} |")
+    return "\n".join(lines)
 
 
 def name(group: Group) -> str:

@@ -5,14 +5,12 @@ from __future__ import annotations
 import logging
 import math
 import secrets
-import signal
-import threading
 import traceback
 from collections import deque
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from statistics import mean
-from types import FrameType, TracebackType
+from types import TracebackType
 from typing import Any, Protocol, runtime_checkable
 
 import torch
@@ -31,10 +29,11 @@ from pgkit.run.evaluate import evaluate
 from pgkit.run.metrics import Metrics, averages, digest, finished_episodes, finished_infos
 from pgkit.run.plots import plot
 from pgkit.run.progress import Live
+from pgkit.run.signals import Signals
+from pgkit.run.threads import fastest_threads
 from pgkit.seams import Stateful
 
 NAN = float("nan")
-SIGNALS = [s for s in signal.Signals if s.name in ("SIGINT", "SIGTERM", "SIGHUP")]
 _log = logging.getLogger("pgkit")
 
 
@@ -74,7 +73,7 @@ class Run:
         self._saved: dict[str, Any] | None = None
         self._tracked: dict[str, Stateful] = {}
         self._eval: Any = None
-        self._interrupted = self._evaluating = False
+        self._signals = Signals(lambda text: self._live.line(text))
         self._lost = ""  # a metric of the last row that is not finite
         self._seen = self._saved_at = 0  # frames of the last step, and in the last checkpoint
         self._claimed = False
@@ -88,13 +87,11 @@ class Run:
             except BaseException:
                 directory.unlock(self._lock)
                 raise
+        self.args.threads = self.args.threads or fastest_threads()
         torch.set_num_threads(self.args.threads)
         set_matmul(self.args.matmul)
         seeding.seed_everything(self.args.seed)
-        self._handlers: dict[signal.Signals, Any] = {}
-        if threading.current_thread() is threading.main_thread():
-            heard = [s for s in SIGNALS if s.name == "SIGINT" or signal.getsignal(s) != signal.SIG_IGN]  # nohup ignores
-            self._handlers = {s: signal.signal(s, self._interrupt) for s in heard}
+        self._signals.listen()
         return self
 
     def _load(self, resume: Path) -> None:
@@ -107,7 +104,7 @@ class Run:
             names = (file or f"pgkit's {self.recipe}" for file in (theirs, mine))
             _log.warning("%s is a run of %s, this is %s: is it the same?", self.dir, *names)
         saved = checkpoint.load(resume if resume.suffix == ".pt" else resume / "checkpoints" / "latest.pt")
-        if self.args.total_frames <= saved["frames"]:
+        if self.args.total_frames <= saved["frames"] and ending.has_ended(self.dir, saved["frames"]):
             if self.args.resume_if_possible:
                 print(f"{self.dir} has already trained {saved['frames']:,} frames: there is nothing left to do")
                 raise SystemExit(0)
@@ -161,6 +158,7 @@ class Run:
         self._claim(tracked)
         self._live = Live(self.args.total_frames, self.frames)
         self._tracked = tracked
+        self._signals.at_once = False
         self._clock.restart(self.frames)
 
     def _claim(self, tracked: dict[str, Stateful]) -> None:
@@ -210,14 +208,14 @@ class Run:
         due = frames >= self.args.total_frames
         if self.args.eval_every:
             due |= frames // self.args.eval_every > self.frames // self.args.eval_every
-        if not (due or self._interrupted or frames // every > self.frames // every):
+        if not (due or self._signals.asked or frames // every > self.frames // every):
             return {}
         self.frames = frames
         if compile_seconds is None:
             compile_seconds = sum(x.compile_seconds for x in self._tracked.values() if isinstance(x, Compiles))
         row = self._row(compile_seconds)
         self._live.update(frames, row["rollout/ep_rew_mean"], row["time/fps"])
-        if due:
+        if due and not self._signals.asked:
             try:
                 row |= self._evaluate(row)
             except BaseException:  # also a second Ctrl-C: what was trained is kept
@@ -225,12 +223,12 @@ class Run:
                 self.save()
                 raise
         self._metrics.write(row)
-        if due or self._interrupted:
+        if due or self._signals.asked:
             try:
                 self.save()
             except UserError as error:
                 _log.warning("%s; the training goes on", error)
-        if self._interrupted:
+        if self._signals.asked:
             raise KeyboardInterrupt
         return row
 
@@ -272,11 +270,11 @@ class Run:
         with self._clock.paused(), seeding.preserved_rng():
             env = self._eval_env()
             env.set_seed(seeding.evaluation_seed(self.args.seed, self.frames))
-            self._evaluating = True
             try:
+                self._signals.at_once = True
                 scores = evaluate(self._agent.actor, env, self.args.eval_episodes)
             finally:
-                self._evaluating = False
+                self._signals.at_once = False
             self._evaluated = {"frames": self.frames, **scores}
             if scores["eval/mean_reward"] > self.best.get("eval/mean_reward", -float("inf")):
                 self.best = self._evaluated
@@ -321,26 +319,35 @@ class Run:
             self._saved_at = self.frames
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None):
-        for number, handler in self._handlers.items():
-            signal.signal(number, handler)
+        # after a signal, any error may be of what else it ended: a compiler, a server of the environment's
+        asked = self._signals.asked and not isinstance(error, Diverged)
+        stopped = error is not None and (asked or self._signals.broke_off(error))
+        try:
+            self._end(error, trace, stopped)
+        finally:
+            self._signals.restore()
+        if stopped and not isinstance(error, KeyboardInterrupt):
+            raise KeyboardInterrupt from error
+
+    def _end(self, error: BaseException | None, trace: TracebackType | None, stopped: bool) -> None:
         if not self._tracked:
             if self._claimed:
                 directory.remove_if_bare(self.dir)
             directory.unlock(self._lock)
             return
         try:
-            if kind is None:
+            if error is None:
                 self._finish()
-            elif error is not None and kind is not KeyboardInterrupt:
+            elif not self._signals.broke_off(error):
                 self._rescue(error, trace)
         finally:
             self._live.close()
             self._close()
-        if kind is None or (kind is KeyboardInterrupt and self._saved_at):
+        if error is None or (stopped and self._saved_at):
             self._live.line(ending.how_to_go_on(self.dir, self.args, self.recipe, self.frames, bool(self.best)))
-        if isinstance(error, SystemExit):
+        if isinstance(error, SystemExit) and not stopped:
             raise UserError(f"something called sys.exit({error.code}) after {self._seen:,} frames") from error
-        if kind is None and self._lost:
+        if error is None and self._lost:
             raise Diverged(f"the training has diverged: {self._lost} is not finite at the end ({self.frames:,} frames)")
 
     def _close(self) -> None:
@@ -369,12 +376,6 @@ class Run:
         where = f"the checkpoint of {self._saved_at:,} frames" if self._saved_at else "no checkpoint yet"
         _log.warning("the run ends at an error; %s has %s%s", self.dir, where, f" ({why})" if why else "")
 
-    def _interrupt(self, number: int, frame: FrameType | None) -> None:
-        if self._interrupted or self._evaluating or not self._tracked:
-            raise KeyboardInterrupt
-        self._interrupted = True
-        self._live.line("stopping after this update; press Ctrl-C again to stop at once")
-
     def _finish(self) -> None:
         if self._evaluated.get("frames") != self.frames:
             try:
@@ -385,5 +386,5 @@ class Run:
             self._metrics.write({"frames": self.frames, "time/wall_s": self._clock.wall, **scores})
         if self._saved_at != self.frames:
             self.save()
-        ending.write_summary(self.dir, self.args, self.recipe, self._clock.wall, self._evaluated, self.best)
         plot([self.dir], self.dir / "curve.png")
+        ending.write_summary(self.dir, self.args, self.recipe, self._clock.wall, self._evaluated, self.best)  # the last

@@ -13,6 +13,8 @@ import numpy as np
 
 from pgkit import files
 from pgkit.envs.gym_list import Gymnasium
+from pgkit.envs.parallel import Parallel
+from pgkit.envs.vmas_batch import Vmas
 from pgkit.errors import UserError
 from pgkit.run.evaluate import evaluate
 from pgkit.run.exported import needs
@@ -36,13 +38,17 @@ def record(policy: Policy, file: Path, episodes: int, seed: int = 0) -> tuple[di
     imageio, file = needs("imageio.v2", "video"), _with_codec(file)
     if policy.args is None:
         raise UserError("a video is made of a run's policy: run.load_policy(RUN_DIR)")
-    shown = dataclasses.replace(policy.args, env={**policy.args.env, "render_mode": "rgb_array"})
+    drawn = {} if policy.args.env_id.startswith("vmas/") else {"render_mode": "rgb_array"}
+    shown = dataclasses.replace(policy.args, env={**policy.args.env, **drawn})
     env = shown.make_env(num_envs=1, seed=seed)
     simulator: Any = env.simulator
     try:
-        if not isinstance(simulator, Gymnasium):
-            raise UserError(f"--video: {env.env_id} is no single Gymnasium environment, which alone can be rendered")
-        fps = int(simulator.envs[0].metadata.get("render_fps") or FPS)
+        if not isinstance(simulator, Gymnasium | Parallel | Vmas):
+            raise UserError(
+                f"--video: {env.env_id} cannot be rendered: it is no Gymnasium or PettingZoo environment and none of "
+                "VMAS's"
+            )
+        fps = FPS if isinstance(simulator, Vmas) else int(simulator.envs[0].metadata.get("render_fps") or FPS)
         how = {"fps": fps, "macro_block_size": 2} if file.suffix == ".mp4" else {"duration": 1000 / fps, "loop": 0}
         writer = None
 
@@ -52,13 +58,30 @@ def record(policy: Policy, file: Path, episodes: int, seed: int = 0) -> tuple[di
             writer.append_data(frame)
 
         try:
-            simulator.envs = [Shown(simulator.envs[0], show)]
+            _show(simulator, show)
             return evaluate(policy, env, episodes), file
         finally:
             if writer is not None:
                 writer.close()
     finally:
         env.close()
+
+
+def _show(simulator: Any, show: Callable[[np.ndarray], None]) -> None:
+    """From now on every frame of the simulator is handed on."""
+    if isinstance(simulator, Gymnasium):
+        simulator.envs = [Shown(simulator.envs[0], show)]
+    elif isinstance(simulator, Parallel):
+        simulator.envs = [ShownParallel(simulator.envs[0], show)]
+    else:
+        advance = simulator.advance
+
+        def shown(*actions: Any) -> Any:
+            made = advance(*actions)
+            show(frame(lambda: simulator.env.render("rgb_array")))
+            return made
+
+        vars(simulator)["advance"] = shown
 
 
 def _with_codec(file: Path) -> Path:
@@ -87,23 +110,50 @@ class Shown(gym.Wrapper):
 
     def reset(self, **kwargs: Any) -> Any:
         result = self.env.reset(**kwargs)
-        self._frame()
+        self.show(frame(self.env.render))
         return result
 
     def step(self, action: Any) -> Any:
         result = self.env.step(action)
-        self._frame()
+        self.show(frame(self.env.render))
         return result
 
-    def _frame(self) -> None:
-        try:
-            frame = self.env.render()
-        except Exception as error:  # each renderer has errors of its own
-            reason = next(iter(str(error).strip().splitlines()), type(error).__name__)
-            raise UserError(
-                f"the environment cannot be rendered ({reason}): on a machine without a display set MUJOCO_GL=egl "
-                "(Debian: libegl1) or MUJOCO_GL=osmesa (libosmesa6)"
-            ) from error
-        if not isinstance(frame, np.ndarray) or frame.ndim != 3:
-            raise UserError(f"render() gives a {type(frame).__name__}, not an image [height, width, 3]")
-        self.show(frame)
+
+class ShownParallel:
+    """The same of a PettingZoo parallel environment."""
+
+    def __init__(self, env: Any, show: Callable[[np.ndarray], None]) -> None:
+        self.env, self.show = env, show
+
+    @property
+    def agents(self) -> list[str]:
+        return self.env.agents
+
+    def reset(self, **kwargs: Any) -> Any:
+        result = self.env.reset(**kwargs)
+        self.show(frame(self.env.render))
+        return result
+
+    def step(self, actions: Any) -> Any:
+        result = self.env.step(actions)
+        if self.env.agents:  # some draw nothing at the end
+            self.show(frame(self.env.render))
+        return result
+
+    def close(self) -> None:
+        self.env.close()
+
+
+def frame(render: Callable[[], Any]) -> np.ndarray:
+    """An image of ``render``'s, ``[height, width, 3]``."""
+    try:
+        image = render()
+    except Exception as error:  # each renderer has errors of its own
+        reason = next(iter(str(error).strip().splitlines()), type(error).__name__)
+        raise UserError(
+            f"the environment cannot be rendered ({reason}): on a machine without a display set MUJOCO_GL=egl "
+            "(Debian: libegl1) or MUJOCO_GL=osmesa (libosmesa6); VMAS needs a display: xvfb-run pgkit eval ..."
+        ) from error
+    if not isinstance(image, np.ndarray) or image.ndim != 3:
+        raise UserError(f"render() gives a {type(image).__name__}, not an image [height, width, 3]")
+    return image

@@ -10,7 +10,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from pgkit.checks import LossView, replay
-from pgkit.data import ReplayBuffer
+from pgkit.data import RayReplay, ReplayBuffer
 from pgkit.errors import UserError
 
 Draw = tuple[TensorDictBase, Tensor]
@@ -106,4 +106,53 @@ class TorchRLBatches:
         return replay.transforms(self.buffer)
 
 
-Batches = OwnBatches | TorchRLBatches
+class RemoteBatches:
+    """From replay in other processes: the batches of a request lie in one block of rows, whose errors go back together.
+
+    The methods are those of :class:`OwnBatches`.
+    """
+
+    def __init__(self, buffer: RayReplay, loss: nn.Module, batch_size: int) -> None:
+        if batch_size != buffer.batch_size:
+            raise UserError(f"batch_size={batch_size}, but the replay sends batches of {buffer.batch_size}: give both")
+        self.buffer, self.batch_size, self.capacity = buffer, batch_size, buffer.capacity
+        self.priority = LossView(loss).priority
+        self._left = list[Tensor]()
+
+    def extend(self, rollout: TensorDictBase) -> None:
+        raise UserError("explorers fill this replay by themselves: call update.train(replay.batches)")
+
+    def draw(self, batches: int) -> Iterator[Draw]:
+        for _ in range(batches):
+            if not self._left:
+                self.buffer.fetch()
+                rows = torch.arange(self.batch_size * self.buffer.batches, device=self.buffer.device)
+                self._left = list(rows.split(self.batch_size))
+            yield cast(TensorDictBase, self.buffer.data), self._left.pop(0)
+
+    def gather(self, data: TensorDictBase, index: Tensor) -> TensorDictBase:
+        return cast(TensorDictBase, data.exclude("td_error")[index])
+
+    def write_back(self, data: TensorDictBase, index: Tensor, batch: TensorDictBase) -> None:
+        data["td_error"].index_copy_(0, index, batch[self.priority].flatten().to(data["td_error"].dtype))
+
+    def written(self) -> list[Tensor]:
+        return []
+
+    def drawn(self) -> None:
+        self.buffer.updates += 1
+        if not self._left:
+            self.buffer.write_back()
+
+    def settings(self) -> dict[str, Any]:
+        return {}
+
+
+Batches = OwnBatches | TorchRLBatches | RemoteBatches
+
+
+def batches_of(buffer: Any, loss: nn.Module, batch_size: int) -> Batches:
+    """The batches of this buffer, of so many rows."""
+    kinds = {ReplayBuffer: OwnBatches, RayReplay: RemoteBatches}
+    source = next((kinds[kind] for kind in kinds if isinstance(buffer, kind)), TorchRLBatches)
+    return source(buffer, loss, batch_size)

@@ -17,7 +17,8 @@ from pgkit.compiled import check_compile, choose, undone
 from pgkit.data import ReplayBuffer
 from pgkit.errors import UserError
 from pgkit.seams import Augmentation
-from pgkit.updates.batches import Batches, OwnBatches, TorchRLBatches
+from pgkit.updates.batches import Batches, batches_of
+from pgkit.updates.interrupts import interruptible
 from pgkit.updates.minibatches import means
 from pgkit.updates.state import load, save
 from pgkit.updates.step import GradientStep, Grads, grads_of, metrics_of
@@ -48,7 +49,8 @@ class OffPolicyUpdate:
     Args:
         loss: any TorchRL off-policy ``LossModule``; the sum of its ``loss_*`` entries is minimized. The target networks
             it holds are averaged here: no ``SoftUpdate`` besides.
-        buffer: :class:`pgkit.data.ReplayBuffer` or any TorchRL replay buffer over single transitions.
+        buffer: :class:`pgkit.data.ReplayBuffer`, :class:`pgkit.data.RayReplay` (then only :meth:`train` trains), or
+            any TorchRL replay buffer over single transitions.
         optimizer: any ``torch.optim`` optimizer; its groups may have learning rates of their own.
         batch_size: rows of a batch.
         updates_per_step: gradient steps for each frame collected; a fraction such as 0.5 adds up.
@@ -61,6 +63,8 @@ class OffPolicyUpdate:
         learning_starts: frames in the replay before the first step, at least ``batch_size``.
         accumulate: batches whose gradients add up to one optimizer step.
         augment: ``batch -> batch`` that changes a batch before the loss reads it, inside the compiled step.
+        project: called with the parameters that a step has trained, inside the compiled step, to bring them back to
+            where they belong: :class:`pgkit.modules.WeightProjection`.
         max_grad_norm: bound of the gradient's norm over all parameters; None: no bound.
         total_frames: frames of the whole training, for ``compile="auto"``.
         compile: ``on``, ``off``, or ``auto`` (compile where at least 3,000 steps are expected).
@@ -83,6 +87,7 @@ class OffPolicyUpdate:
         learning_starts: int = 1_000,
         accumulate: int = 1,
         augment: Augmentation | None = None,
+        project: Callable[[Sequence[Tensor]], None] | None = None,
         max_grad_norm: float | None = None,
         total_frames: int | None = None,
         compile: str = "auto",
@@ -90,19 +95,19 @@ class OffPolicyUpdate:
         check_compile(compile)
         self.loss, self.buffer, self.optimizer = loss, buffer, optimizer
         self.batch_size, self.updates_per_step, self.actor_delay = batch_size, updates_per_step, actor_delay
-        self.delay_targets, self.accumulate, self.augment = delay_targets, accumulate, augment
+        self.delay_targets, self.accumulate, self.augment, self.project = delay_targets, accumulate, augment, project
         self.tau, self.learning_starts, self.max_grad_norm = tau, learning_starts, max_grad_norm
         self.total_frames, self.compile = total_frames, compile
         self.frames = self.updates = 0
         self.between: Callable[[Grads], Grads] | None = None  # changes the gradients before the optimizer's step
         self._due = 0.0
-        source = OwnBatches if isinstance(buffer, ReplayBuffer) else TorchRLBatches
-        self._batches: Batches = source(buffer, loss, batch_size * accumulate)
+        self._batches: Batches = batches_of(buffer, loss, batch_size * accumulate)
         one_tau = None if isinstance(tau, Mapping) else tau
         check_settings(LossView(loss), vars(self) | {"capacity": self._batches.capacity, "tau": one_tau})
         self._average, self._copy_statistics = averaging(loss, tau), copying(loss)
         self._plan: Plan | None = None
 
+    @interruptible
     def __call__(self, rollout: TensorDictBase) -> dict[str, float]:
         """Stores a rollout ``[num_envs, T]`` and trains; metrics are means over the steps, none if none was due."""
         self._batches.extend(rollout)
@@ -123,6 +128,7 @@ class OffPolicyUpdate:
         self._due -= count
         return self.train(count)
 
+    @interruptible
     def train(self, updates: int) -> dict[str, float]:
         """So many gradient steps on what is stored."""
         results: dict[GradientStep, list[Tensor]] = {}
@@ -206,6 +212,12 @@ class OffPolicyUpdate:
             grads = grads_of(out, params, only)
             return metrics_of(out, names, like=grads[0]), grads
 
+        def after() -> None:
+            if self.project is not None:
+                self.project(params)
+            if average and self._average is not None:
+                self._average()
+
         steps = None if self.total_frames is None else self.total_frames * self.updates_per_step
         return GradientStep(
             gradients,
@@ -215,7 +227,7 @@ class OffPolicyUpdate:
             watch={"the loss": self.loss, "the augmentation": self.augment},
             holds=self._batches.written(),
             max_grad_norm=self.max_grad_norm,
-            average=self._average if average else None,
+            after=after,
             between=self.between,
             apart=self.accumulate > 1,
             # a step costs 10 times a PPO step, so compiling pays 10 times sooner

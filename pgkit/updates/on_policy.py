@@ -18,6 +18,8 @@ from pgkit.errors import UserError
 from pgkit.functional import standardize
 from pgkit.optim import parameters
 from pgkit.seams import Augmentation
+from pgkit.updates.interrupts import interruptible
+from pgkit.updates.learners import Alone, Learners
 from pgkit.updates.minibatches import means, minibatches
 from pgkit.updates.sequences import as_rows
 from pgkit.updates.state import load, save
@@ -103,34 +105,38 @@ class OnPolicyUpdate:
         self.recompute_advantage, self.normalize_advantage = recompute_advantage, normalize_advantage
         self.target_kl, self.schedules, self.total_frames = target_kl, dict(schedules or {}), total_frames
         self.compile, self.frames = compile, 0
+        self.learners: Alone | Learners = Alone()  # data_parallel changes it
         self.between: Callable[[Grads], Grads] | None = None  # changes the gradients before the optimizer's step
-        self._generator = torch.Generator().manual_seed(int(torch.randint(2**62, ())) if seed is None else seed)
+        self.generator = torch.Generator().manual_seed(int(torch.randint(2**62, ())) if seed is None else seed)
         self._plan: Plan | None = None
         check_settings(self._view, vars(self))
 
+    @interruptible
     def __call__(self, rollout: TensorDictBase) -> dict[str, float]:
         """Trains on a rollout ``[num_envs, T]``; metrics are means over the minibatches.
 
         Time is the last dimension: flattened, an advantage would run from one environment into the next.
         """
+        self.learners.begin(rollout)
         self._follow_schedules()
         if self._plan is None:
             self._plan, flat = self._assemble(rollout)
         else:
             flat = self._rows(self._plan, rollout)
         plan, size, results = self._plan, self._size(flat), list[Tensor]()
-        step = plan.step.bind(flat, torch.arange(size, device=flat.device))
-        epoch = 0
+        epoch, bound, step = 0, None, plan.step
         for epoch in range(1, self.epochs + 1):
             if epoch > 1 and self.recompute_advantage:
                 flat = self._rows(plan, rollout).update(flat.select(*plan.anchors))
-                step = plan.step.bind(flat, torch.arange(size, device=flat.device))
+            batches = list(minibatches(len(flat), size, self.generator, flat.device, self.accumulate))
+            rows = self.learners.prepared(flat, batches)
+            if rows is not bound:
+                bound, step = rows, plan.step.bind(rows, torch.arange(size, device=flat.device))
             start = len(results)
-            for indices in minibatches(len(flat), size, self._generator, flat.device, self.accumulate):
-                results.append(step(*indices))
+            results += [step(*indices) for indices in batches]
             if self.target_kl is not None and self._kl(plan.step.names, results[start:]) > 1.5 * self.target_kl:
                 break
-        self.frames += rollout.numel()
+        self.frames += rollout.numel() * self.learners.size
         rate = float(self.optimizer.param_groups[0]["lr"])
         return means(plan.step.names, results) | {"epochs": float(epoch), "learning_rate": rate}
 
@@ -151,12 +157,12 @@ class OnPolicyUpdate:
 
     def state_dict(self) -> dict[str, Any]:
         """Networks, coefficients, optimizer, statistics of the advantage block, minibatch order and frame count."""
-        return save(self._parts()) | {"generator": self._generator.get_state(), "frames": self.frames}
+        return save(self._parts()) | {"generator": self.generator.get_state(), "frames": self.frames}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restores :meth:`state_dict`; the compiled step is built again at the next call."""
         load(self._parts(), state)
-        self._generator.set_state(state["generator"])
+        self.generator.set_state(state["generator"])
         self.frames, self._plan = state["frames"], None
 
     def _parts(self) -> dict[str, Any]:
@@ -181,7 +187,9 @@ class OnPolicyUpdate:
         batch = flat[: self._size(flat)]
         names = assembly(view, self.optimizer, batch, rollout=rollout, resumed=self.frames > 0)
         anchors = [key for key in (*view.keys("value"), *view.keys("sample_log_prob")) if key in keys]
-        step = self._gradient_step(names, flat.numel(), self.epochs * -(-len(flat) // len(batch)))
+        step = self._gradient_step(
+            names, rollout.numel() * self.learners.size, self.epochs * -(-len(flat) // len(batch))
+        )
         return Plan(block, keys, anchors, step, batch), flat
 
     def _gradient_step(self, names: Sequence[str], frames: int, steps: int) -> GradientStep:
@@ -206,6 +214,8 @@ class OnPolicyUpdate:
             watch={"the loss": self.loss, "the augmentation": self.augment},
             max_grad_norm=self.max_grad_norm,
             between=self.between,
+            mean=self.learners.mean,
+            agree=self.learners.agree,
             apart=self.accumulate > 1,
             mode=choose(self.compile, calls, least_calls=30_000),
         )
@@ -217,7 +227,8 @@ class OnPolicyUpdate:
             return None
         rollouts = None if self.total_frames is None else self.total_frames / rollout.numel()
         mode = choose(self.compile, rollouts, least_calls=5_000)
-        return None if mode == "off" else CompiledAdvantage(cast(TensorDictModuleBase, self.advantage), mode)
+        block = cast(TensorDictModuleBase, self.advantage)
+        return None if mode == "off" else CompiledAdvantage(block, mode, self.learners.agree)
 
     def _follow_schedules(self) -> None:
         for name, schedule in self.schedules.items():
@@ -238,7 +249,7 @@ class OnPolicyUpdate:
 class CompiledAdvantage:
     """An advantage block in native code."""
 
-    def __init__(self, block: TensorDictModuleBase, mode: Mode) -> None:
+    def __init__(self, block: TensorDictModuleBase, mode: Mode, agree: Callable[[bool], bool] = bool) -> None:
         def entries(data: TensorDictBase) -> list[Tensor]:
             out = block(data.copy())
             return [out[key] for key in block.out_keys]
@@ -250,7 +261,7 @@ class CompiledAdvantage:
 
         self.block = block
         self.native = compiled(
-            entries, {"the advantage block": block}, others, mode, name="the advantage block", most=300,
+            entries, {"the advantage block": block}, others, mode, name="the advantage block", agree=agree, most=300,
             but={"training"},
         )  # fmt: skip
 

@@ -48,8 +48,10 @@ class GradientStep:
         watch: modules that ``gradients`` uses, by name, as in :func:`pgkit.compiled.compiled`.
         holds: further tensors that change in place.
         max_grad_norm: bound of the gradient's norm over all parameters; None: no bound.
-        average: moves the target networks, last.
-        between: ``grads -> grads`` before the norm clip: the average over several learners.
+        after: what follows the optimizer's step: the target networks move.
+        between: ``grads -> grads`` before the norm clip.
+        mean: ``[metrics, *grads] -> [metrics, *grads]`` before that: the mean over several learners.
+        agree: as in :func:`pgkit.compiled.compiled`.
         apart: keeps the two graphs apart, for a call on several minibatches.
         mode: as in :func:`pgkit.compiled.compiled`.
 
@@ -67,18 +69,21 @@ class GradientStep:
         watch: Mapping[str, Any],
         holds: Iterable[Tensor] = (),
         max_grad_norm: float | None = None,
-        average: Callable[[], None] | None = None,
+        after: Callable[[], None] | None = None,
         between: Callable[[Grads], Grads] | None = None,
+        mean: Callable[[Sequence[Tensor]], list[Tensor]] | None = None,
+        agree: Callable[[bool], bool] = bool,
         apart: bool = False,
         mode: Mode = "off",
     ) -> None:
         if max_grad_norm is not None and max_grad_norm <= 0:
             raise UserError(f"max_grad_norm={max_grad_norm} lets nothing be trained: give a bound above 0, or None")
-        self.optimizer, self.names, self.between = optimizer, [*names, "grad_norm"], between
+        self.optimizer, self.names = optimizer, [*names, "grad_norm"]
+        self.between, self.mean = between, mean
         self._params = optim.parameters(optimizer) if params is None else list(params)
         self._rules = rules = None if mode == "off" else optim.bound(optimizer, self._params)
         step = partial(optim.step, optimizer, self._params) if rules is None else rules.apply
-        self._apart = apart or between is not None or rules is None
+        self._apart = apart or between is not None or mean is not None or rules is None
 
         @torch.no_grad()
         def apply(grads: Grads) -> Tensor:
@@ -87,8 +92,8 @@ class GradientStep:
                 factor = optim.computed_once((max_grad_norm / (norm + 1e-6)).clamp(max=1.0))
                 grads = [grad * factor for grad in grads]
             step(grads)
-            if average is not None:
-                average()
+            if after is not None:
+                after()
             return norm
 
         def first(data: TensorDictBase, index: Tensor) -> list[Tensor]:
@@ -99,7 +104,7 @@ class GradientStep:
             return [apply(list(grads))]
 
         held = [*self._params, *([] if rules is None else rules.tensors), *holds]
-        native = partial(compiled, watch=watch, holds=held)
+        native = partial(compiled, watch=watch, holds=held, agree=agree)
         self.native = (
             native(first, others=other_rows, mode=mode, name="the update"),
             native(second, others=_other_gradients, mode="off" if rules is None else mode, name="the optimizer's step"),
@@ -136,7 +141,8 @@ class GradientStep:
     def _in_two(self, run: Callable[[Tensor], Sequence[Tensor]]) -> Callable[..., Tensor]:
         def call(*indices: Tensor) -> Tensor:
             rows = sum(map(len, indices))
-            metrics, *grads = _sum(map(run, indices), [len(index) / rows for index in indices])
+            results = _sum(map(run, indices), [len(index) / rows for index in indices])
+            metrics, *grads = results if self.mean is None else self.mean(results)
             grads = grads if self.between is None else self.between(grads)
             (norm,) = self.native[1].bind(None, *grads)(*grads)
             return torch.cat([metrics, norm[None]])

@@ -15,6 +15,7 @@ from pgkit.checks import LossView, assembly, check_settings, diagram
 from pgkit.compiled import check_compile, choose
 from pgkit.functional import conjugate_gradient
 from pgkit.optim import parameters
+from pgkit.updates.interrupts import interruptible
 from pgkit.updates.minibatches import means, minibatches
 from pgkit.updates.sequences import as_rows
 from pgkit.updates.state import load, save
@@ -104,6 +105,7 @@ class TrustRegionUpdate:
         self.between: Callable[[Grads], Grads] | None = None  # changes the critic's gradients before its step
         self._plan: Plan | None = None
 
+    @interruptible
     def __call__(self, rollout: TensorDictBase) -> dict[str, float]:
         """Trains on a rollout ``[num_envs, T]``: time is the last dimension."""
         estimated = self._view.estimated(rollout, self.advantage)

@@ -43,11 +43,22 @@ def test_kinds(kind, expected):
 
 
 def test_groups_without_spread_leave_the_batch():
-    out = advantages.GroupRelative(2, drop=True)(rollout(1.0, 3.0, 5.0, 5.0))
-    assert torch.equal(out["masks", "all_assistant_mask"], MASK & torch.tensor([[1], [1], [0], [0]]).bool())
-    assert out["log_probs", "full"][2:].eq(0).all() and out["log_probs", "full"][1].tolist() == [0, -1, -2]
-    every = advantages.GroupRelative(2, drop=True)(rollout(1.0, 1.0, 5.0, 5.0))
-    assert not every["masks", "all_assistant_mask"].any()
+    out = advantages.GroupRelative(2, drop=True)(rollout(5.0, 5.0, 1.0, 3.0))
+    assert out.shape == (2,) and out["next", "reward"].flatten().tolist() == [1, 3]
+    assert torch.equal(out["masks", "all_assistant_mask"], MASK[2:])
+    torch.testing.assert_close(out["advantage"][:, 1, 0], torch.tensor([-(0.5**0.5), 0.5**0.5]), rtol=1e-5, atol=1e-5)
+
+
+def test_rows_without_spread_fill_up_a_minibatch():
+    for rewards, live in ((5.0, 5.0, 1.0, 3.0), [2, 3]), ((5.0, 5.0, 5.0, 5.0), []):
+        out = advantages.GroupRelative(2, drop=True, multiple=4)(rollout(*rewards))
+        assert out.shape == (4,)  # live rows first
+        first, rest = out[: len(live)], out[len(live) :]
+        assert torch.equal(first["masks", "all_assistant_mask"], MASK[live])
+        assert not rest["masks", "all_assistant_mask"].any() and not rest["log_probs", "full"].any()
+        assert not rest["advantage"].any()
+    least = advantages.GroupRelative(2, drop=True)(rollout(5.0, 5.0, 1.0, 1.0))
+    assert least.shape == (2,) and not least["masks", "all_assistant_mask"].any()
 
 
 def test_divergence_off_the_reward():

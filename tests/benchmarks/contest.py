@@ -119,10 +119,12 @@ def table(rounds: dict[str, list[dict[str, Any]]], contenders: dict[str, Contend
 
 
 def machine() -> dict[str, Any]:
-    """The processor, core count, Python and package versions."""
+    """The processor with its instruction set, core count, Python and package versions."""
+    from pgkit.compiled.products import cpu
+
     versions = {name: metadata.version(name) for name in PACKAGES if _installed(name)}
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    text = f"{cores} cores, {platform.machine()}, Python {platform.python_version()}"
+    text = f"{cores} cores, {cpu()}, Python {platform.python_version()}"
     return {
         "text": ", ".join([text, *(f"{name} {version}" for name, version in versions.items())]),
         "versions": versions,

@@ -27,7 +27,7 @@ class Options(contest.Options):
     warmup: int = 3 * SIZE
 
 
-def pgkit(seed: int, workers: int) -> Iterator[int]:
+def pgkit(seed: int, workers: int, overlap: bool = False) -> Iterator[int]:
     """pgkit through its public API, as in the README."""
     import torch
 
@@ -45,7 +45,8 @@ def pgkit(seed: int, workers: int) -> Iterator[int]:
         max_grad_norm=0.5,
         compile="on",
     )
-    collector = collectors.VectorCollector(env, actor, frames_per_batch=SIZE, total_frames=10**12)
+    make_collector = collectors.AsyncCollector if overlap else collectors.VectorCollector
+    collector: Any = make_collector(env, actor, frames_per_batch=SIZE, total_frames=10**12)
     try:
         for rollout in collector:
             update(rollout)
@@ -105,7 +106,11 @@ def _baselines(algorithm: Any, env: Any, activation: Any, seed: int) -> Iterator
 
 CONTENDERS = {
     "pgkit": contest.Contender(partial(pgkit, workers=2), "pgkit", "compiled, 2 workers"),
+    "pgkit-overlap": contest.Contender(
+        partial(pgkit, workers=2, overlap=True), "pgkit", "as the first, with --overlap"
+    ),
     "pgkit-1-worker": contest.Contender(partial(pgkit, workers=1), "pgkit", "compiled, one process"),
+    "pgkit-1-overlap": contest.Contender(partial(pgkit, workers=1, overlap=True), "pgkit", "1 worker, --overlap"),
     "sb3": contest.Contender(sb3, "stable_baselines3", "DummyVecEnv"),
     "sbx": contest.Contender(sbx, "sbx", "DummyVecEnv, JAX"),
     "torchrl": contest.Contender(partial(torchrl, compiled=False), "torchrl", "Collector, SerialEnv, eager"),

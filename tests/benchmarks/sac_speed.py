@@ -29,6 +29,8 @@ class Options(contest.Options):
 
     frames: int = 5000
     warmup: int = RANDOM_FRAMES + 1000
+    replay: bool = True
+    """Also time the parts of replay and update; they compile two more graphs."""
 
 
 def agent(seed: int, stored: int = 0, sampler: Any = None) -> tuple[Any, Any, Any]:
@@ -55,12 +57,15 @@ def frames(steps: int) -> TensorDict:
     return TensorDict({**now, "next": after}, [1, steps])
 
 
-def pgkit(seed: int, steps: int = STEPS, stored: int = 0) -> Iterator[int]:
+def pgkit(seed: int, steps: int = STEPS, stored: int = 0, matmul: str = "auto", overlap: bool = False) -> Iterator[int]:
     """pgkit through its public API, so many frames and as many updates in turn."""
     from pgkit import collectors
+    from pgkit.compiled import set_matmul
 
+    set_matmul(matmul)
     env, actor, update = agent(seed, stored)
-    collector = collectors.VectorCollector(env, actor, frames_per_batch=steps, init_random_frames=RANDOM_FRAMES)
+    make_collector = collectors.AsyncCollector if overlap else collectors.VectorCollector
+    collector: Any = make_collector(env, actor, frames_per_batch=steps, init_random_frames=RANDOM_FRAMES)
     for rollout in collector:
         update(rollout)
         yield collector.frames
@@ -80,11 +85,11 @@ def sbx(seed: int, steps: int = 1) -> Iterator[int]:
     yield from _baselines(SAC, seed, steps)
 
 
-def torchrl(seed: int, compiled: bool) -> Iterator[int]:
+def torchrl(seed: int, compiled: bool, steps: int = CHUNK) -> Iterator[int]:
     """An agent assembled from TorchRL's parts."""
     import torchrl_parts
 
-    sizes = {"batch_size": BATCH, "random_frames": RANDOM_FRAMES, "chunk": CHUNK, "buffer": BUFFER}
+    sizes = {"batch_size": BATCH, "random_frames": RANDOM_FRAMES, "chunk": steps, "buffer": BUFFER}
     yield from torchrl_parts.sac(seed, env_id=ENV_ID, compiled=compiled, **sizes)
 
 
@@ -113,12 +118,13 @@ def _baselines(algorithm: Any, seed: int, steps: int) -> Iterator[int]:
 
 
 def floor(threads: int) -> tuple[float, float]:
-    """Milliseconds that the matmuls of one SAC update take and their GFLOP, with nothing else around them."""
+    """Milliseconds that the matmuls of one SAC update take by the faster of MKL and oneDNN, and their GFLOP."""
     torch.set_num_threads(threads)
     actor, critic = [OBSERVATION, WIDTH, WIDTH, 2 * ACTION], [OBSERVATION + ACTION, WIDTH, WIDTH, 1]
     learning, policy = floors.actor_critic(actor, critic, targets=2, learning=2, climbed=2)
     matmuls = learning + policy
-    return contest.milliseconds(lambda: floors.run(matmuls), calls=300, warmup=50), floors.gflop(matmuls)
+    kernels = (partial(floors.run, matmuls), partial(floors.run_onednn, matmuls))
+    return min(contest.milliseconds(kernel, calls=300, warmup=50) for kernel in kernels), floors.gflop(matmuls)
 
 
 def replay(threads: int, prioritized: bool) -> dict[str, float]:
@@ -161,6 +167,9 @@ CONTENDERS = {
     "pgkit": contest.Contender(pgkit, "pgkit", f"{STEPS} frames, {STEPS} updates, the recipe's default"),
     "pgkit-1": contest.Contender(partial(pgkit, steps=1), "pgkit", "one frame, one update"),
     "pgkit-1M": contest.Contender(partial(pgkit, stored=BUFFER), "pgkit", "as the first, a million frames stored"),
+    "pgkit-overlap": contest.Contender(partial(pgkit, overlap=True), "pgkit", "as the first, with --overlap"),
+    "pgkit-bf16": contest.Contender(partial(pgkit, matmul="bf16"), "pgkit", "as the first, with --matmul bf16"),
+    "pgkit-float32": contest.Contender(partial(pgkit, matmul="float32"), "pgkit", "as the first, MKL's products alone"),
     "sb3": contest.Contender(sb3, "stable_baselines3", "one frame, one update"),
     f"sb3-{STEPS}": contest.Contender(
         partial(sb3, steps=STEPS), "stable_baselines3", f"{STEPS} frames, {STEPS} updates"
@@ -170,6 +179,9 @@ CONTENDERS = {
     "torchrl": contest.Contender(
         partial(torchrl, compiled=False), "torchrl", f"{CHUNK} frames, {CHUNK} updates; eager"
     ),
+    f"torchrl-{STEPS}": contest.Contender(
+        partial(torchrl, compiled=False, steps=STEPS), "torchrl", f"{STEPS} frames, {STEPS} updates; eager"
+    ),
     "torchrl-compiled": contest.Contender(
         partial(torchrl, compiled=True), "torchrl", f"{CHUNK} frames, {CHUNK} updates; torch.compile(update)"
     ),
@@ -177,13 +189,15 @@ CONTENDERS = {
 
 if __name__ == "__main__":
     options = tyro.cli(Options, description=__doc__)
-    alone = {} if options.contender else {"before": floor(threads=2)[0]}
+    threads = options.threads or 2
+    alone = {} if options.contender else {"before": floor(threads)[0]}
     result = contest.run("SAC, HalfCheetah-v5, one update a frame", options, CONTENDERS, "pgkit")
-    alone["after"], gflop = floor(threads=2)
+    alone["after"], gflop = floor(threads)
     times, most = " to ".join(f"{ms:.2f}" for ms in sorted(alone.values())), 1e3 / min(alone.values())
-    print(f"\nfloor, 2 threads: the matmuls of one update ({gflop:.2f} GFLOP) take {times} ms", end=" ")
+    print(f"\nfloor, {threads} thread(s): the matmuls of one update ({gflop:.2f} GFLOP) take {times} ms", end=" ")
     print(f"(before and after the rounds): at most {most:.0f} updates/s")
-    replays = {name: replay(2, name == "prioritized") for name in ("uniform", "prioritized")}
+    kinds = ("uniform", "prioritized") if options.replay else ()
+    replays = {name: replay(threads, name == "prioritized") for name in kinds}
     for name, ms in replays.items():
         total = ms["write"] + ms["draw"] + ms["step"]
         share = (total - ms["step without gather"]) / total

@@ -1,12 +1,16 @@
 """Experiments, reports and searches from the command line, with runs that take seconds."""
 
 import csv
+import dataclasses
+import typing
 
 import pytest
 
+from pgkit.cli import recipes, studies
 from pgkit.cli.main import main
 from pgkit.errors import UserError
 from pgkit.run import experiment, tune
+from pgkit.run.args import check, of_type
 
 SHORT = ["--total-frames", "256", "--steps", "16", "--eval-episodes", "1", "--compile", "off"]
 
@@ -42,6 +46,17 @@ def test_a_failed_run_is_named_and_the_others_go_on(tmp_path, monkeypatch, capsy
     assert end.value.code == 2 and "NoSuchEnv-v1 seed 1" in out.err
     assert "FAILED, exit 2: error: unknown environment id 'NoSuchEnv-v1'" in out.out
     assert [row["env"] for row in rows("here/results.csv")] == ["CartPole-v1"]
+
+
+def test_runs_with_other_flags_have_other_directories(tmp_path):
+    def directories(*flags):
+        return [cell.directory for cell in experiment.cells("ppo", ["dm_control/x-v0"], [1, 2], flags, tmp_path)]
+
+    plain, other = directories(), directories("--lmbda", "0.9")
+    assert [path.name for path in plain] == ["dm_control-x-v0__1", "dm_control-x-v0__2"]
+    assert [path.name for path in other] == ["dm_control-x-v0__lmbda-0.9__1", "dm_control-x-v0__lmbda-0.9__2"]
+    long = [directories("--env.some_long_keyword_of_it", "a" * 60 + end)[0].name for end in "bc"]
+    assert long[0] != long[1] and max(map(len, long)) < 100
 
 
 @pytest.mark.parametrize(
@@ -96,3 +111,19 @@ def test_settings_as_flags():
     )  # fmt: skip
     with pytest.raises(UserError, match="no search space"):
         tune.tune("ppo", {}, "X-v1", trials=1, folder=None)
+
+
+@pytest.mark.parametrize("recipe", [name for name in recipes.names() if name != "grpo"])  # grpo trains on no env id
+def test_a_recipe_s_search_space_is_made_of_its_settings(recipe):
+    space = studies.search_space(recipe)
+    args = recipes.load(recipes.find(recipe)).Args
+    assert len(space) >= 4
+    for name, values in space.items():
+        hint = typing.get_type_hints(args)[name]
+        for value in values if isinstance(values, list) else values[:2]:
+            check(dataclasses.replace(args(), **{name: of_type(value, hint)}))
+        default = getattr(args(), name)
+        numbers = [x for x in values if not isinstance(x, str)]
+        assert default in values or min(numbers) <= default <= max(numbers), (
+            f"{name}: the default {default} is outside {values}"
+        )

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from pgkit import collectors, envs, modules
+from pgkit import advantages, collectors, envs, losses, modules, updates
 from pgkit.errors import UserError
 
 
@@ -43,6 +43,45 @@ def test_the_first_rollouts_are_those_of_the_collector_in_turn_and_then_one_upda
     assert lags == [0, 1, 1, 1]
     assert ahead.frames == 320
     ahead.shutdown()
+
+
+def ppo(num_envs=4, workers=1):
+    torch.manual_seed(0)
+    env = envs.make("Pendulum-v1", num_envs=num_envs, seed=3, workers=workers)
+    normalizer = modules.ObsNormalizer(env)
+    actor = modules.gaussian_actor(env, (16,), normalizer=normalizer)
+    critic = modules.state_value(env, (16,), normalizer=normalizer)
+    adam = torch.optim.Adam([*actor.parameters(), *critic.parameters()], lr=0.01)
+    loss, gae = losses.ClipPPOLoss(actor, critic), advantages.GAE(critic, gamma=0.9, lmbda=0.9)
+    update = updates.OnPolicyUpdate(loss, gae, adam, epochs=2, minibatch_size=20, compile="off", seed=5)
+    return env, normalizer, actor, update
+
+
+def test_ppo_beside_the_update_equals_a_plain_loop_with_weights_one_update_old():
+    env, normalizer, actor, update = ppo(workers=2)
+    ahead, metrics = collectors.AsyncCollector(env, actor, frames_per_batch=80, compile="off"), []
+    for _ in range(4):
+        rollout = ahead.rollout()
+        metrics.append(update(rollout))
+        normalizer.update(rollout["observation"])
+    ahead.shutdown()
+
+    env, normalizer, plain, update = ppo()
+    _, _, behind, _ = ppo()  # the actor that collects
+    in_turn, expected = collectors.VectorCollector(env, behind, frames_per_batch=80, compile="off"), []
+    for number in range(4):
+        rollout = in_turn.rollout()
+        given = rollout.select("observation", "action", "action_log_prob")
+        collected = behind.get_dist(given).log_prob(given["action"])
+        torch.testing.assert_close(given["action_log_prob"], collected)  # the ratio's denominator
+        ratio = (plain.get_dist(given).log_prob(given["action"]) - collected).detach().exp()
+        assert bool((ratio == 1).all()) == (number == 0)
+        now = {key: x.clone() for key, x in plain.state_dict().items()}
+        expected.append(update(rollout))
+        normalizer.update(rollout["observation"])
+        behind.load_state_dict(now)
+    assert metrics == expected
+    assert all(torch.equal(x, y) for x, y in zip(actor.state_dict().values(), plain.state_dict().values(), strict=True))
 
 
 def test_two_workers_of_whole_rollouts_give_the_numbers_of_one():

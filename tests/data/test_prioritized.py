@@ -62,3 +62,15 @@ def test_priorities_that_are_not_finite_are_named():
     tree.set(torch.tensor([3]), float("nan"))
     with pytest.raises(UserError, match="priorities sum to nan: training diverged"):
         tree.find(torch.tensor([0.5]))
+
+
+@pytest.mark.parametrize("n_steps", [1, 3])
+def test_frames_that_come_with_an_error_get_its_priority_when_they_can_be_drawn(n_steps):
+    """Two rollouts of 4 frames with errors 0 to 7; with 3-step returns the last two frames wait."""
+    sampler = data.Prioritized(alpha=2.0, eps=1.0)
+    buffer = data.ReplayBuffer(envs.make("Pendulum-v1"), 10, sampler=sampler, n_steps=n_steps)
+    for first in (0, 4):
+        rollout = hand_made(list(range(first, first + 5)), [1] * 4)
+        buffer.extend(rollout.set("td_error", torch.arange(first, first + 4.0).view(1, 4)))
+    ready = 8 - (n_steps - 1)
+    assert sampler.tree.values[:8].tolist() == [(i + 1) ** 2.0 if i < ready else 0.0 for i in range(8)]

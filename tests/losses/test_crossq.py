@@ -71,6 +71,31 @@ def test_values_by_hand_of_a_joint_batch_norm():
     assert norm.steps.flatten().tolist() == [1, 1]
 
 
+@pytest.mark.usefixtures("constant_noise")
+def test_a_delayed_target_by_its_running_statistics():
+    # as above, but y = 1 + 0.5 * (s' - m) / σ with the target's running statistics, m = 1 and σ = 2
+    env = envs.make("Pendulum-v1")
+    body = partial(modules.batch_renorm_mlp, hidden=(), norm=partial(modules.EnsembleBatchRenorm, eps=0.0))
+    critics = modules.q_value(env, 2, body=body).double()
+    norm, last = critics.module.layers
+    last.weight.data.zero_()
+    last.weight.data[:, 0, 0] = 1.0
+    norm.mean.fill_(1.0)
+    norm.var.fill_(4.0)
+    actor, fixed = modules.tanh_normal_actor(env, (8,)).double(), controllers.FixedTemperature(0.0)
+    loss = losses.CrossQLoss(actor, critics, temperature=fixed, gamma=0.5, delay_qvalue=True)
+    assert updates.targets.averaging(loss, 0.005) is not None
+    data = batch(2).double()
+    for key in ("done", "terminated"):
+        data["next", key] = torch.zeros(2, 1, dtype=torch.bool)
+    data["observation"] = torch.tensor([[0.0, 1.0, 1.0], [2.0, 2.0, 2.0]]).double()
+    data["next", "observation"][:, 0] = torch.tensor([4.0, 10.0])
+    data["next", "reward"].fill_(1.0)
+    q, target = [(0 - 4) / 14**0.5, (2 - 4) / 14**0.5], [1 + 0.5 * 3 / 2, 1 + 0.5 * 9 / 2]
+    squares = [(a - b) ** 2 for a, b in zip(q, target, strict=True)]
+    assert loss(data)["loss_qvalue"].item() == pytest.approx(2 * sum(squares) / 2)
+
+
 def test_there_is_no_target_network():
     env = envs.make("Pendulum-v1")
     loss = losses.CrossQLoss(modules.tanh_normal_actor(env, (8,)), modules.q_value(env, 2, (8,)))

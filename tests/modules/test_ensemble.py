@@ -17,6 +17,7 @@ BLOCKS = {
     "droq": {"norm": modules.EnsembleLayerNorm, "dropout": 0.2},
     "crossq": {"body": partial(modules.batch_renorm_mlp, hidden=(8, 8))},
     "simba": {"body": partial(modules.simba, width=8, blocks=2)},
+    "flash": {"body": partial(modules.flash, width=8, blocks=2)},
 }
 
 
@@ -51,6 +52,55 @@ def test_layer_norm_is_that_of_each_member():
     x = torch.randn(2, 5, 6) * 3 + 1
     for k in range(2):
         torch.testing.assert_close(norm(x)[k], F.layer_norm(x[k], (6,), norm.weight[k, 0], norm.bias[k, 0]))
+
+
+def test_rms_norm_is_that_of_each_member():
+    norm = modules.EnsembleRMSNorm(2, 6)
+    nn.init.normal_(norm.weight)
+    x = torch.randn(2, 5, 6) * 3 + 1
+    for k in range(2):
+        torch.testing.assert_close(norm(x)[k], F.rms_norm(x[k], (6,), norm.weight[k, 0], 1e-6))
+
+
+def test_flash_is_batch_norm_linear_blocks_and_rms_norm():
+    layers, width = modules.flash(2, 5, width=4, blocks=1, expansion=3)
+    for layer in layers:
+        for p in layer.parameters():
+            nn.init.normal_(p)
+    x = torch.randn(2, 16, 5) * 2 + 1
+    norm, first, block, last = layers
+
+    def normed(x, layer, k):
+        return F.batch_norm(x, None, None, layer.weight[k, 0], layer.bias[k, 0], training=True)
+
+    for k in range(2):
+        y = normed(x[k], norm, k) @ first.weight[k]
+        inner = normed(y @ block.inner.weight[k], block.inner_norm, k).relu()
+        y = y + normed(inner @ block.outer.weight[k], block.outer_norm, k).relu()
+        y = F.rms_norm(y, (4,), last.weight[k, 0], 1e-6)
+        torch.testing.assert_close(nn.Sequential(*layers)(x)[k], y, atol=1e-4, rtol=1e-4)
+    assert width == 4 and block.inner.weight.shape == (2, 4, 12) and first.bias is None
+
+
+def test_projection_gives_weights_their_length_and_keeps_their_direction():
+    net = critics(2, body=partial(modules.flash, width=8, blocks=1))
+    for p in net.parameters():
+        nn.init.normal_(p, std=3.0)
+    before = {name: p.detach().clone() for name, p in net.named_parameters()}
+    plain = nn.Linear(3, 2)
+    modules.WeightProjection(net, plain)
+    torch.testing.assert_close(plain.weight.norm(dim=1), torch.ones(2))  # [out, in]
+    norm, linear, block, rms, last = net.module.layers
+    for layer in (linear, block.inner, block.outer, last):  # [critics, in, out]
+        torch.testing.assert_close(layer.weight.norm(dim=1), torch.ones_like(layer.weight[:, 0]))
+    for layer in (norm, block.inner_norm, block.outer_norm):
+        length = torch.cat([layer.weight, layer.bias], -1).norm(dim=-1)
+        torch.testing.assert_close(length, torch.full_like(length, layer.weight.shape[-1] ** 0.5))
+    torch.testing.assert_close(rms.weight.norm(dim=-1), torch.full((2, 1), 8**0.5))
+    after = dict(net.named_parameters())
+    ratio = after["module.layers.0.weight"] / before["module.layers.0.weight"]
+    torch.testing.assert_close(ratio, ratio[..., :1].expand_as(ratio))
+    assert torch.equal(after["module.layers.4.bias"], before["module.layers.4.bias"])
 
 
 def test_dropout_differs_across_members_and_rows_and_is_off_in_evaluation():

@@ -142,3 +142,33 @@ def test_the_noise_is_carried_through_an_episode_across_rollouts_and_resumes(com
 def test_refusals():
     with pytest.raises(UserError, match=r"modules\.categorical_actor"):
         modules.deterministic_actor(envs.make("CartPole-v1"))
+
+
+def test_noise_is_repeated_for_a_drawn_number_of_steps():
+    torch.manual_seed(0)
+    env = envs.make("Pendulum-v1", num_envs=4, seed=1)  # episodes of 200 steps, actions within 2
+    actor = modules.tanh_normal_actor(env, (8,))
+    exploring = modules.NoiseRepeat(actor, env, zeta=2.0, longest=4)
+    torch.testing.assert_close(exploring.shares, torch.tensor([144, 180, 196, 205]) / 205)  # 1, 1/4, 1/9, 1/16
+    rollout = collectors.VectorCollector(env, exploring, frames_per_batch=4 * 2_000, compile="off").rollout()
+    state = rollout["next", "recurrent_state"]
+    noise, left = state[..., 0], state[..., 1]
+    out = actor(rollout.select("observation"))
+    expected = 2 * (out["loc"] + out["scale"] * noise.unsqueeze(-1)).tanh()
+    torch.testing.assert_close(rollout["action"], expected, atol=1e-5, rtol=0)
+    drawn = torch.ones_like(noise, dtype=torch.bool)
+    drawn[:, 1:] = noise[:, 1:] != noise[:, :-1]
+    assert drawn[:, ::200].all()  # an episode begins
+    assert (left[:, :-1][drawn[:, 1:] & ~_starts(drawn)] == 0).all()
+    lengths = left[drawn] + 1
+    shares = torch.stack([(lengths == n).float().mean() for n in (1, 2, 3, 4)])
+    torch.testing.assert_close(shares, torch.tensor([144, 36, 16, 9]) / 205, atol=0.02, rtol=0)
+    assert noise[drawn].mean().abs() < 0.05 and abs(noise[drawn].std() - 1) < 0.05
+    obs = np.zeros((5, 3), np.float32)
+    assert np.ptp(act(exploring, obs), axis=0).max() == 0
+
+
+def _starts(drawn):
+    starts = torch.zeros_like(drawn)
+    starts[:, ::200] = True
+    return starts[:, 1:]

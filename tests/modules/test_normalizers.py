@@ -1,5 +1,6 @@
 import pytest
 import torch
+from tensordict import TensorDict
 
 from pgkit import envs, modules
 from pgkit.errors import UserError
@@ -179,3 +180,20 @@ def test_a_scale_for_each_agent_rescales_the_critic_s_own_layers():
     assert scale.scale.flatten().diff().min() > 0.3
     with pytest.raises(UserError, match="the scale has 4 agents, the critic's last layer is one for all"):
         scale.update(torch.randn(50, 4, 1), modules.state_value(env))
+
+
+def test_rewards_are_divided_by_the_deviation_or_the_largest_of_their_returns():
+    # gamma 0.5, one environment, an episode that ends at its third step: G = 1, 2 + 0.5 = 2.5, 3 + 1.25 = 4.25 | 8, 4
+    scale = modules.RewardScale(1, gamma=0.5, g_max=2.0)
+    rewards, done = torch.tensor([1.0, 2.0, 3.0, 8.0, 0.0]), torch.tensor([False, False, True, False, False])
+    for part in (slice(0, 2), slice(2, 5)):  # carried across rollouts
+        scale.update(TensorDict({"next": {"reward": rewards[None, part, None], "done": done[None, part, None]}}, [1]))
+    returns = torch.tensor([1.0, 2.5, 4.25, 8.0, 4.0])
+    torch.testing.assert_close(scale.moments.var, returns.var(correction=0))
+    assert scale.returns.tolist() == [4.0] and scale.largest == 8.0
+    assert scale.scale.item() == 4.0  # 8 / g_max, above the deviation of 2.34
+    scale.g_max = 100.0
+    assert scale.scale.item() == pytest.approx(returns.std(correction=0).item())
+    batch = TensorDict({"next": {"reward": torch.tensor([[3.0]])}}, [1])
+    assert scale(batch)["next", "reward"].item() == pytest.approx(3 / returns.std(correction=0).item())
+    assert batch["next", "reward"].item() == 3.0

@@ -5,6 +5,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import imageio.v2 as imageio
+import numpy as np
 import pytest
 import torch
 
@@ -79,6 +81,17 @@ def test_a_resumed_run_equals_the_straight_one(flags: Any, tmp_path: Path):
     assert rows(tmp_path / "straight") == rows(tmp_path / "resumed")
 
 
+def test_an_evaluation_in_between_changes_nothing(tmp_path: Path):
+    given = ("--env-id", "vmas/balance", "--env.max_episode_steps", 30, *PLAIN, "--steps", 25, "--epochs", 1)
+    pgkit("run", "mappo", *given, "--run-dir", tmp_path / "often")
+    pgkit("run", "mappo", *given, "--eval-every", 0, "--run-dir", tmp_path / "once")
+    trained = [
+        [{k: x for k, x in row.items() if not k.startswith("eval/")} for row in rows(tmp_path / name)]
+        for name in ("often", "once")
+    ]
+    assert trained[0][-1] == trained[1][-1] and len(trained[0]) >= len(trained[1])
+
+
 @pytest.mark.parametrize(
     "flags",
     [
@@ -93,6 +106,19 @@ def test_runs_for_a_few_hundred_frames(tmp_path: Path, flags: Any):
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary["frames"] == 400 and summary["eval/mean_reward"] < 100
     assert "mean_reward" in pgkit("eval", tmp_path / "run", "--episodes", 2).stdout
+
+
+def test_a_run_of_groups_is_drawn_plotted_and_loaded(tmp_path: Path):
+    small = ("--num-envs", 4, "--total-frames", 200, "--steps", 25, "--eval-episodes", 2, "--compile", "off")
+    pgkit("run", "mappo", "--env-id", "mpe2/simple_adversary_v3", *small, "--run-dir", tmp_path / "run")
+    said = pgkit("eval", tmp_path / "run", "--episodes", 1, "--video", tmp_path / "out.gif").stdout
+    frames = imageio.mimread(tmp_path / "out.gif")
+    assert "out.gif" in said and len(frames) >= 25 and (frames[0] != frames[10]).any()
+    pgkit("plot", tmp_path / "run", "--out", tmp_path / "curve.png")
+    assert (tmp_path / "curve.png").stat().st_size > 1_000
+    policy = run.load_policy(tmp_path / "run")
+    made = policy.predict({key[0]: np.zeros(shape, np.float32) for key, shape in policy.shapes.items()})
+    assert {name: x.shape for name, x in made.items()} == {"adversary": (1,), "agent": (2,)}
 
 
 def built(make: Any, frames: int = 64, **settings: Any) -> Any:
@@ -151,10 +177,11 @@ def test_two_groups_are_trained_as_two_agents_would_be():
     assert all(torch.equal(a, b) for a, b in zip(both["grads"], grads, strict=True))
 
 
-def test_a_compiled_update_equals_the_eager_one():
+@pytest.mark.parametrize("make", [Fading, Unlike])
+def test_a_compiled_update_equals_the_eager_one(make: Any):
     results = []
     for compile in ("off", "on"):
-        _, agent, rollout = built(Fading)
+        _, agent, rollout = built(make)
         results.append(trained(agent, rollout, compile, epochs=1))
     (eager, weights), (native, theirs) = results
     for a, b in zip(weights, theirs, strict=True):

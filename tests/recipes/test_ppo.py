@@ -44,9 +44,10 @@ def test_same_seed_same_metrics_and_another_seed_differs(tmp_path):
     assert len(rows(tmp_path / "a")) == 4
 
 
-def test_resumed_run_equals_the_straight_one(tmp_path):
-    train(tmp_path / "straight", frames=2048)
-    train(tmp_path / "resumed", frames=1024)
+@pytest.mark.parametrize("overlap", ["no-overlap", "overlap"])
+def test_resumed_run_equals_the_straight_one(tmp_path, overlap):
+    train(tmp_path / "straight", f"--{overlap}", frames=2048)
+    train(tmp_path / "resumed", f"--{overlap}", frames=1024)
     pgkit("run", "ppo", "--resume", tmp_path / "resumed", "--total-frames", 2048)
     assert rows(tmp_path / "straight") == rows(tmp_path / "resumed")
 
@@ -77,6 +78,7 @@ def test_runs_for_a_few_hundred_frames(tmp_path, flags):
             "unknown environment id 'CartPol-v1'; the nearest names are CartPole-v1",
         ),
         (("--total-frames", 10), "total_frames=10 is less than one rollout"),
+        (("--overlap", "--collector", "torchrl"), "TorchRL's Collector waits for the update"),
         (("--num-envs", 2, "--workers", 3), "every worker needs at least one environment"),
     ],
 )

@@ -1,7 +1,9 @@
 import random
 from types import SimpleNamespace
 
+import gymnasium as gym
 import numpy as np
+import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import ProbabilisticTensorDictModule, TensorDictModule, TensorDictSequential
@@ -29,12 +31,26 @@ def test_every_slot_plays_its_own_share(kit: SimpleNamespace):
     assert returns.tolist() == [1, 2, 2, 4, 3]
 
 
-def test_an_episode_that_goes_on_and_on_is_said(kit: SimpleNamespace, monkeypatch, caplog):
-    monkeypatch.setitem(run.play.__globals__, "LONG_EPISODE", 2)
-    run.play(kit.policy(), kit.Env(num_envs=2, seed=1), episodes=2)  # of one and two steps
-    assert not caplog.text
-    run.play(kit.policy(), kit.Env(num_envs=3, seed=1), episodes=3)
-    assert "has come to 2 steps and goes on" in caplog.text
+@pytest.mark.fault(
+    kind=12, injected="evaluation of an environment that never ends", outcome="ended at a limit, counted, a warning"
+)
+def test_an_episode_that_goes_on_and_on_is_ended_and_counts(caplog: pytest.LogCaptureFixture):
+    class Every5th(gym.Env):  # its first episode has no end, the second one has 5 steps, and so on
+        observation_space, action_space = gym.spaces.Box(-1, 1, (2,)), gym.spaces.Box(-1, 1, (1,))
+        episode = 0
+
+        def reset(self, *, seed=None, options=None):
+            self.episode, self.steps = self.episode + 1, 0
+            return np.zeros(2, np.float32), {}
+
+        def step(self, action):
+            self.steps += 1
+            return np.zeros(2, np.float32), 1.0, self.episode % 2 == 0 and self.steps == 5, False, {}
+
+    env = envs.make(Every5th, 2)
+    returns, lengths = run.play(NoisyPolicy(), env, episodes=5, longest=9)
+    assert lengths.tolist() == [9, 5, 9, 9, 5] and returns.tolist() == lengths.tolist()
+    assert "an episode of evaluation was ended at 9 steps and counts as it is" in caplog.text
 
 
 def test_scores_are_mean_and_population_deviation(kit: SimpleNamespace):

@@ -347,6 +347,21 @@ def test_a_full_disk_stops_no_training_and_leaves_no_half_file(
 
 
 @pytest.mark.fault(
+    kind=20, injected="a limit amid a file (ulimit -f), as a full disk", outcome="one line, the old file stays"
+)
+def test_a_write_that_fails_amid_a_file_leaves_the_old_one(tmp_path: Path):
+    files.save(tmp_path / "x", {"a": 1})
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, hard))
+    try:
+        with pytest.raises(UserError, match="x cannot be written: File too large"):
+            files.save(tmp_path / "x", {"a": torch.zeros(100_000)})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert files.load(tmp_path / "x") == {"a": 1} and [path.name for path in tmp_path.iterdir()] == ["x"]
+
+
+@pytest.mark.fault(
     kind=20,
     injected="a run directory that is deleted under way",
     outcome="it is said at once; training goes on, and the end is one line",

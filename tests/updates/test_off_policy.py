@@ -16,12 +16,16 @@ from pgkit.errors import UserError
 from pgkit.updates.targets import averaging
 
 
-def agent(compile="off", *, seed=0, buffer=None, loss="pgkit", num_envs=1, optimizer=torch.optim.Adam, **kwargs):
+def agent(
+    compile="off", *, seed=0, buffer=None, loss="pgkit", num_envs=1, optimizer=torch.optim.Adam, unit=False, **kwargs
+):
     torch.manual_seed(seed)
     env = envs.make("Pendulum-v1", num_envs)
-    actor = modules.tanh_normal_actor(env, (16,))
+    actor, critics = modules.tanh_normal_actor(env, (16,)), modules.q_value(env, hidden=(16,))
+    if unit:
+        kwargs["project"] = modules.WeightProjection(actor, critics)
     if loss == "pgkit":
-        module = losses.SACLoss(actor, modules.q_value(env, hidden=(16,)), gamma=0.9)
+        module = losses.SACLoss(actor, critics, gamma=0.9)
     else:
         module = TorchRLSACLoss(actor, [modules.q_value(env, 1, (16,)) for _ in range(2)], target_entropy=-1.0)
         module.make_value_estimator(gamma=0.9)
@@ -56,8 +60,15 @@ def prioritized(n_steps=1):
         {"buffer": prioritized(3), "actor_delay": 2, "max_grad_norm": 1.0},
         {"loss": "torchrl"},
         {"buffer": lambda env: TensorDictReplayBuffer(storage=LazyTensorStorage(500), batch_size=32)},
+        {"unit": True, "actor_delay": 2},
     ],
-    ids=["plain", "prioritized, 3 steps, delayed actor", "TorchRL's loss", "TorchRL's replay buffer"],
+    ids=[
+        "plain",
+        "prioritized, 3 steps, delayed actor",
+        "TorchRL's loss",
+        "TorchRL's replay buffer",
+        "weights of unit length, delayed actor",
+    ],
 )
 def test_eager_equals_compiled(settings):
     results = []
@@ -509,3 +520,12 @@ def test_a_term_that_trains_the_critics_alone_is_not_delayed_with_the_actor():
     update.train(1)
     between = update.train(1)
     assert {name for name in between if name.startswith("loss_")} == {"loss_qvalue", "loss_conservative"}
+
+
+def test_projection_follows_the_optimizer_and_comes_before_the_targets():
+    seen = []
+    update, collector = agent(project=lambda params: seen.append(len(params)), updates_per_step=0.25, actor_delay=2)
+    update._average = lambda: seen.append("averaged")
+    train(update, collector, rollouts=3)
+    every, critics = len(update.optimizer.param_groups[0]["params"]), 2 * 2  # weight and bias of two layers
+    assert update.updates == 16 and seen == [every, "averaged", critics, "averaged"] * 8

@@ -205,7 +205,7 @@ def test_optimizer_steps_as_torch_would(optimizer):
         update(rollout)
         estimate: Any = twin.advantage
         batch = estimate(make_rollout(i, torch.float64)).reshape(-1)
-        order = torch.randperm(128, generator=twin._generator)
+        order = torch.randperm(128, generator=twin.generator)
         out = twin.loss(batch[order])
         twin.optimizer.zero_grad()
         (out["loss_objective"] + out["loss_critic"] + out["loss_entropy"]).backward()
@@ -378,7 +378,7 @@ def test_a_reset_of_the_optimizer_s_state_begins_again(compile):
     fresh = make_agent(compile=compile, epochs=1)
     update(make_rollout(0))
     fresh.loss.load_state_dict(update.loss.state_dict())
-    fresh._generator.set_state(update._generator.get_state())
+    fresh.generator.set_state(update.generator.get_state())
     update.optimizer.state.clear()
     assert update(make_rollout(1)) == pytest.approx(fresh(make_rollout(1)), rel=1e-5, abs=1e-6)
     torch.testing.assert_close(parameters(update), parameters(fresh))
