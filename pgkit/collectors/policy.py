@@ -15,7 +15,7 @@ from torch.overrides import TorchFunctionMode
 from torchrl.data import Composite, MultiCategorical, TensorSpec
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from pgkit.collectors.actor import is_state, output_keys
+from pgkit.collectors.actor import acting, is_state, output_keys
 from pgkit.collectors.noise import Streams, census, fed
 from pgkit.compiled import Compiled, Mode, compiled, undone
 from pgkit.envs.seeding import episode_seed
@@ -31,7 +31,7 @@ def function_of(actor: TensorDictModuleBase, keys: Sequence[Key]) -> Act:
 
     def act(*inputs: Tensor) -> tuple[Tensor, ...]:
         data = TensorDict(dict(zip(keys, inputs, strict=True)), batch_size=inputs[0].shape[:1])
-        with set_exploration_type(ExplorationType.RANDOM):
+        with acting(actor), set_exploration_type(ExplorationType.RANDOM):
             out = actor(data)
         return tuple(out[key] for key in outputs)
 

@@ -21,6 +21,7 @@ from pgkit.errors import UserError
 from pgkit.seams import Entries, Key, Simulator
 
 MASK: Key = ("collector", "mask")
+LARGEST = 1e18  # of observations and rewards: squared it is still finite in float32
 
 
 def allocate(steps: int, env: VectorEnv, outputs: Entries) -> Entries:
@@ -232,14 +233,18 @@ def _check(tensors: dict[Any, Tensor], env: VectorEnv) -> None:
 
 
 def _check_finite(x: Tensor, key: Key) -> None:
-    if x.dtype.is_floating_point and not torch.isfinite(x).all():
-        row, step = (~torch.isfinite(x)).nonzero()[0, :2].tolist()
-        found = x[row, step][~torch.isfinite(x[row, step])].flatten()[0].item()
-        name = ".".join(_path(key))
-        raise UserError(
-            f"'{name}' of environment {row} is {found} at step {step} of the rollout: the update would turn every "
-            "weight into NaN; mend the environment, or clip it in a wrapper (gymnasium.wrappers.TransformObservation)"
-        )
+    if not x.dtype.is_floating_point or not x.numel():
+        return
+    low, high = x.aminmax()  # NaN where one is
+    if low >= -LARGEST and high <= LARGEST:
+        return
+    wrong = ~(x.abs() <= LARGEST)
+    row, step = wrong.nonzero()[0, :2].tolist()
+    found, name = x[row, step][wrong[row, step]].flatten()[0].item(), ".".join(_path(key))
+    raise UserError(
+        f"'{name}' of environment {row} is {found:g} at step {step} of the rollout: the update would turn every "
+        "weight into NaN; mend the environment, or clip it in a wrapper (gymnasium.wrappers.TransformObservation)"
+    )
 
 
 def _rows(buffers: Entries, keys: Iterable[Key]) -> list[list[Tensor]]:

@@ -92,7 +92,7 @@ class Torch:
 
     def _restart(self, seed: int) -> None:
         self.seed, self._steps = seed, 0
-        self.env.set_seed(seed)
+        self.env.set_seed(seed % (2**31 - self.num_envs))  # TorchRL adds to it; 31 bits
         self._data: TensorDictBase | None = None  # what the next step is made with
         self._untouched = False
         self._begin_counts()
@@ -173,14 +173,24 @@ class Torch:
 
     def _entries(self, data: TensorDictBase, spec: Composite) -> Entries:
         found = {_key(key): data.get(key) for key in spec.keys(True, True)}
-        return {key: x.unsqueeze(0) for key, x in found.items()} if self._one else found
+        found = {key: x.unsqueeze(0) for key, x in found.items()} if self._one else found
+        for key, x in found.items():
+            if x.shape != spec[key].shape:
+                raise self._wrong(key, x, tuple(spec[key].shape))
+        return found
+
+    def _wrong(self, key: Key, x: Tensor, expected: Any) -> UserError:
+        found, name = f"of shape {tuple(x.shape)} and type {x.dtype}", ".".join(as_path(key))
+        return UserError(f"{type(_inner(self.env)).__name__} gave '{name}' {found}, its spec says {expected}")
 
     def _flags(self, after: TensorDictBase) -> tuple[Entries, Entries]:
         terminated, truncated = {}, {}
         for path in self._ends:
             done, ended = after.get((*path, "done")), after.get((*path, "terminated"), None)
-            ended = done if ended is None else ended
-            cut = after.get((*path, "truncated"), None)
+            ended, cut = done if ended is None else ended, after.get((*path, "truncated"), None)
+            for name, x in (("done", done), ("terminated", ended), ("truncated", done if cut is None else cut)):
+                if x.dtype != torch.bool or x.shape != done.shape:
+                    raise self._wrong((*path, name), x, f"bool {tuple(done.shape)}")
             cut = done & ~ended if cut is None else cut
             both = (ended.unsqueeze(0), cut.unsqueeze(0)) if self._one else (ended, cut)
             terminated[_key((*path, "terminated"))], truncated[_key((*path, "truncated"))] = both

@@ -47,6 +47,13 @@ class Loss(LossModule):
                 )
         super().convert_to_functional(module, module_name, *args, **kwargs)
 
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        """``forward``; a ``UserError`` for an empty batch."""
+        for batch in args[:1]:
+            if isinstance(batch, TensorDictBase) and not batch.batch_size.numel():
+                raise UserError(f"{type(self).__name__} got an empty batch {list(batch.batch_size)}: give it rows")
+        return super().__call__(*args, **kwargs)
+
     def __getattr__(self, item: str) -> Any:
         if item.startswith("target_") and item.endswith("_params") and self._modules.get(item) is None:
             return getattr(self, item.removeprefix("target_")).detach()  # LossModule's .data is hidden from a recording

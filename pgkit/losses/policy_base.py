@@ -23,6 +23,7 @@ from pgkit.functional import (
     standardize,
     value_loss,
 )
+from pgkit.functional.modes import in_evaluation
 from pgkit.functional.values import Distance
 from pgkit.losses.actors import need_distribution
 from pgkit.losses.base import Loss, masks_of
@@ -48,6 +49,9 @@ class PolicyLoss(Loss):
     It holds both networks as TorchRL losses do (``actor_network``, ``actor_network_params``, ...), names the keys,
     and gives subclasses verbs: :meth:`distribution`, :meth:`log_prob`, :meth:`log_ratio`, :meth:`kl`, :meth:`value`;
     and :meth:`result`, or its parts :meth:`add_entropy` and :meth:`add_critic`.
+
+    The actor is evaluated in evaluation mode (no dropout, normalization by running statistics), as it collects: the
+    first ratio is 1. The critic keeps the mode that it was given in.
 
     Args:
         actor_network: probabilistic actor.
@@ -123,7 +127,7 @@ class PolicyLoss(Loss):
 
     def distribution(self, batch: TensorDictBase) -> Distribution:
         """The policy's distribution at the batch's observations; the batch is left as it is."""
-        with self.actor_network_params.to_module(self.actor_network):
+        with self.actor_network_params.to_module(self.actor_network), in_evaluation(self.actor_network):
             entries = batch.select(*self.actor_network.in_keys, strict=False)  # a composite's "params" it writes itself
             return self.actor_network.get_dist(entries)
 
@@ -154,8 +158,9 @@ class PolicyLoss(Loss):
 
     def keep_distribution(self, batch: TensorDictBase) -> TensorDictBase:
         """Writes the policy's distribution into the batch (``loc`` and ``scale``, or ``logits``), as of now."""
-        with torch.no_grad(), self.actor_network_params.to_module(self.actor_network):
-            out = self.actor_network.get_dist_params(batch.select(*self.actor_network.in_keys))
+        actor = self.actor_network
+        with torch.no_grad(), self.actor_network_params.to_module(actor), in_evaluation(actor):
+            out = actor.get_dist_params(batch.select(*actor.in_keys))
         return batch.update(out.select(*self.distribution_keys))
 
     @property

@@ -178,7 +178,7 @@ class Run:
         if not self._saved:
             self._lock = directory.claim(self.dir, self.args, self.recipe)
             self._claimed = True
-        config.write_config(self.dir, self.args, self.recipe, before, identity)
+        config.write_config(self.dir, self.args, self.recipe, before, identity, self._eval_env().env_id)
         self._metrics = Metrics(self.dir, upto=self.frames, identity=identity)
 
     def step(
