@@ -181,7 +181,7 @@ class Torch:
 
     def _wrong(self, key: Key, x: Tensor, expected: Any) -> UserError:
         found, name = f"of shape {tuple(x.shape)} and type {x.dtype}", ".".join(as_path(key))
-        return UserError(f"{type(_inner(self.env)).__name__} gave '{name}' {found}, its spec says {expected}")
+        return UserError(f"{type(innermost(self.env)).__name__} gave '{name}' {found}, its spec says {expected}")
 
     def _flags(self, after: TensorDictBase) -> tuple[Entries, Entries]:
         terminated, truncated = {}, {}
