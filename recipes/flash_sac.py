@@ -1,7 +1,7 @@
 """FlashSAC: SAC with residual batch-normalized networks, distributional critics and weights of unit length.
 
 The defaults are the paper's settings with networks half as wide and half its batch, which two CPU cores can train.
-``--actor-width 128 --critic-width 256 --batch-size 512`` is the paper's size, at about six times the cost.
+``--actor-width 128 --critic-width 256 --batch-size 512`` is the paper's size, at eight times the arithmetic.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ from pgkit.compiled.branches import every_branch
 from pgkit.compiled.constants import Constants, tensors_of
 from pgkit.compiled.door import Compiled, Mode, check_compile, choose, compiled, has_compiler
 from pgkit.compiled.native import Instead, copy_all
-from pgkit.compiled.products import Matmul, load_matmul_state, matmul_state, set_matmul
+from pgkit.compiled.products import Matmul, chosen, load_matmul_state, matmul_state, set_matmul
 from pgkit.compiled.trial import undone, written_by
 
 __all__ = [
@@ -15,6 +15,7 @@ __all__ = [
     "Mode",
     "check_compile",
     "choose",
+    "chosen",
     "compiled",
     "copy_all",
     "every_branch",

@@ -70,8 +70,9 @@ def _mask_in_place(graph: GraphModule) -> None:
     aten = torch.ops.aten
     for put in graph.graph.find_nodes(op="call_function", target=aten.index_put_.default):
         x, masks, value = put.args[:3]
-        pick, views = value, []
-        while pick.target is not aten.index.Tensor and (_is_elementwise(pick) or pick.target is aten.view.default):
+        pick: Any = value
+        views: list[Any] = []
+        while pick.target is not aten.index.Tensor and _is_elementwise(pick):
             views += [pick] if pick.target is aten.view.default else []  # of one picked element, without its dimension
             (pick,) = _with_dimensions(pick)
         same = pick.target is aten.index.Tensor and pick.args[1] == masks and len(pick.users) == 1
@@ -85,7 +86,8 @@ def _mask_in_place(graph: GraphModule) -> None:
             view.replace_all_uses_with(view.args[0])
             graph.graph.erase_node(view)
         with graph.graph.inserting_before(put):
-            mask, rest = masks[0], x.meta["val"].ndim - masks[0].meta["val"].ndim
+            mask: Any = masks[0]
+            rest = x.meta["val"].ndim - mask.meta["val"].ndim
             for _ in range(rest):
                 mask = graph.graph.call_function(aten.unsqueeze.default, (mask, -1))
             masked = graph.graph.call_function(aten.where.self, (mask, put.args[2], x))
@@ -115,9 +117,10 @@ def _is_mask(index: Sequence[Node | None], x: Node) -> bool:
 
 
 def _is_elementwise(node: Node) -> bool:
-    """Whether this is an elementwise operation on one tensor and numbers, and its result is used once."""
+    """Whether this is an elementwise operation on one tensor and numbers, or a view, and its result is used once."""
     one = len(_with_dimensions(node)) == len(node.users) == 1
-    return one and torch.Tag.pointwise in _tags(node)
+    view = node.target is torch.ops.aten.view.default
+    return one and (view or torch.Tag.pointwise in _tags(node))
 
 
 def _tags(node: Node) -> Sequence[torch.Tag]:

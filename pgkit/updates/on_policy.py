@@ -262,14 +262,9 @@ class CompiledAdvantage:
 
         self.block = block
         self.native = compiled(
-            entries,
-            {"the advantage block": block},
-            others,
-            mode,
-            name="the advantage block",
-            agree=agree,
-            most=300,
-        )
+            entries, {"the advantage block": block}, others, mode, name="the advantage block", agree=agree, most=300,
+            but={"training"},
+        )  # fmt: skip
 
     def __call__(self, rollout: TensorDictBase) -> TensorDictBase:
         for key, x in zip(self.block.out_keys, self.native.bind(rollout)(), strict=True):
