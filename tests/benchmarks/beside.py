@@ -89,16 +89,19 @@ def serve(what: str) -> None:
 
 
 def start(tree: Path, what: str) -> Any:
-    """The process of one tree, warmed up."""
+    """The process of one tree, which begins to compile."""
     tree = tree.resolve()
     paths = os.pathsep.join([str(tree), str(tree / "tests/benchmarks")])
     command = [sys.executable, "-P", __file__, "--worker", "--what", what]
     pipes: Any = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-    process: Any = subprocess.Popen(command, env=os.environ | {"PYTHONPATH": paths}, cwd=tree, **pipes)
+    return subprocess.Popen(command, env=os.environ | {"PYTHONPATH": paths}, cwd=tree, **pipes)
+
+
+def wait(process: Any) -> None:
+    """Until it is ready."""
     while (line := process.stdout.readline()) != "ready\n":
         if not line:
-            raise SystemExit(f"{tree}: the benchmark ended")
-    return process
+            raise SystemExit("a tree's benchmark ended")
 
 
 def turn_of(process: Any) -> float:
@@ -110,6 +113,8 @@ def turn_of(process: Any) -> float:
 def main(options: Options) -> None:
     """Prints one line a tree."""
     processes = [start(tree, options.what) for tree in options.trees]
+    for process in processes:
+        wait(process)
     turns = [[turn_of(process) for process in processes] for _ in range(options.turns)]
     for at, (tree, process) in enumerate(zip(options.trees, processes, strict=True)):
         times, ratios = sorted(row[at] for row in turns), sorted(row[0] / row[at] for row in turns)
