@@ -18,8 +18,9 @@ from tensordict import TensorDict, TensorDictBase
 from pgkit.errors import UserError
 
 _MARK = b"pgkit-sha256"  # at the end of a file, before the 32 bytes of its hash
-_NUMPY, _TENSORDICT = "<numpy>", "<tensordict>"  # what torch's safe loading does not take; tensors stand for them
-_PLAIN = (torch.Tensor, torch.Size, torch.device, torch.dtype, str, bytes, bool, int, float, type(None))
+# what torch's safe loading does not take; tensors stand for them
+_NUMPY, _TENSORDICT, _BYTES = "<numpy>", "<tensordict>", "<bytes>"
+_PLAIN = (torch.Tensor, torch.Size, torch.device, torch.dtype, str, bool, int, float, type(None))
 
 
 @contextlib.contextmanager
@@ -130,6 +131,8 @@ def _encode(x: Any, where: str) -> Any:
     """``x`` in the types that torch loads without running code; where it holds others, a UserError says where."""
     if isinstance(x, np.ndarray) and x.dtype != object:
         return (_NUMPY, torch.from_numpy(np.ascontiguousarray(x)).reshape(x.shape))
+    if isinstance(x, bytes):
+        return (_BYTES, torch.tensor(list(x), dtype=torch.uint8))
     if isinstance(x, np.generic):
         return x.item()
     if isinstance(x, TensorDictBase):
@@ -151,6 +154,8 @@ def _decode(x: Any) -> Any:
         return {key: _decode(value) for key, value in x.items()}
     if isinstance(x, tuple) and x[:1] == (_NUMPY,):
         return x[1].numpy()
+    if isinstance(x, tuple) and x[:1] == (_BYTES,):
+        return bytes(x[1].tolist())
     if isinstance(x, tuple) and x[:1] == (_TENSORDICT,):
         return TensorDict({key: _decode(value) for key, value in x[1].items()}, x[2])
     if isinstance(x, list | tuple) and not isinstance(x, torch.Size):

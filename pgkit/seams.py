@@ -156,6 +156,13 @@ class Memory(Protocol):
 
 
 @runtime_checkable
+class Noisy(Protocol):
+    """A layer that explores by noise of its weights, in training mode."""
+
+    def reset_noise(self) -> None: ...
+
+
+@runtime_checkable
 class Replay(Protocol):
     """What an off-policy update stores rollouts in and draws batches from."""
 

@@ -89,11 +89,11 @@ def agent(args: Args, env: EnvBase) -> run.Agent:
     if actions is None:
         raise UserError(f"dqn needs one discrete action, '{args.env_id}' has another action space: use sac or td3")
     shape, image = env.observation_spec_unbatched["observation"].shape, modules.image_encoder(env)
-    if len(shape) != 1 and image is None:
+    if len(shape) > 2 and image is None:
         raise UserError(f"dqn reads vectors and images, an observation of '{args.env_id}' is {list(shape)}: flatten it")
-    sizes = (shape[0] if image is None else image.features, actions)
-    net = modules.mlp(*sizes, args.hidden, torch.nn.ReLU)
-    net = net if image is None else torch.nn.Sequential(image, net)
+    sizes = (shape.numel() if image is None else image.features, actions)
+    net, first = modules.mlp(*sizes, args.hidden, torch.nn.ReLU), modules.FlatMatrix() if len(shape) == 2 else image
+    net = net if first is None else torch.nn.Sequential(first, net)
     actor = QValueActor(net, in_keys=["observation"], action_space="categorical")
     settings = {"loss_function": args.loss_function, "double_dqn": args.double}
     loss = DQNLoss(actor, action_space="categorical", delay_value=True, **settings)

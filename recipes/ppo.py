@@ -193,6 +193,8 @@ def main(args: Args) -> None:
                 built.scale.update(rollout["value_target"])
             log.step(collector.frames, rollout, metrics)
         collector.shutdown()
+        if isinstance(update, updates.RayLearners):
+            update.shutdown()
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from torchrl.envs import EnvBase
 from torchrl.modules import DistributionalQValueActor, NoisyLinear
 from torchrl.objectives import DistributionalDQNLoss
 
-from pgkit import collectors, controllers, data, run, updates
+from pgkit import collectors, controllers, data, modules, run, updates
 from pgkit.errors import UserError
 
 
@@ -112,10 +112,11 @@ def agent(args: Args, env: EnvBase) -> run.Agent:
     if args.v_min >= args.v_max:
         raise UserError(f"--v-min {args.v_min:g} --v-max {args.v_max:g}: give a least return below the largest")
     shape = env.observation_spec_unbatched["observation"].shape
-    if len(shape) != 1:
+    if len(shape) > 2:
         raise UserError(f"rainbow reads vectors, an observation of '{args.env_id}' is {list(shape)}: flatten it")
-    sizes = (shape[0], actions)
+    sizes = (shape.numel(), actions)
     net = DuelingNoisyNet(*sizes, args.atoms, args.hidden, args.noise)
+    net = nn.Sequential(modules.FlatMatrix(), net) if len(shape) == 2 else net
     actor = DistributionalQValueActor(
         TensorDictModule(net, in_keys=["observation"], out_keys=["action_value"]),
         support=torch.linspace(args.v_min, args.v_max, args.atoms),

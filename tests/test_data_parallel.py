@@ -11,11 +11,12 @@ import torch.distributed as dist
 import torch.multiprocessing as mp
 from tensordict import TensorDict
 
-from pgkit import advantages, collectors, envs, losses, modules, updates
+from pgkit import advantages, collectors, envs, losses, modules, run, updates
 from pgkit.compiled import compiled
 from pgkit.errors import UserError
 from pgkit.functional import standardize
 from pgkit.updates import on_policy
+from tests.recipes.test_ppo import pgkit, rows
 
 ENVS, STEPS, ROUNDS = 4, 26, 2
 CASES = {  # of an update over 52 rows a learner: minibatches of 20, 20 and 12
@@ -59,8 +60,11 @@ def make_rollout(seed, masked=False):
 def outcome(update, normalizer, metrics):
     """What the learners have learned."""
     state = [x.clone() for values in update.optimizer.state.values() for x in values.values()]
-    return {"parameters": list(update.loss.parameters()), "optimizer": state, "metrics": metrics} | {
-        "normalizer": list(normalizer.state_dict().values())
+    return {
+        "parameters": [p.detach().clone() for p in update.loss.parameters()],
+        "optimizer": state,
+        "normalizer": list(normalizer.state_dict().values()),
+        "metrics": metrics,
     }
 
 
@@ -210,3 +214,17 @@ def test_standardized_alone_is_standardized(both):
         torch.testing.assert_close(learners.standardize(x, mask, [0, 1, 3]), standardize(x, mask, [0, 1, 3]))
     finally:
         dist.destroy_process_group()
+
+
+def test_ppo_with_two_learners(tmp_path):
+    """The recipe's settings count both learners together."""
+    flags = ["--env-id", "Pendulum-v1", "--num-envs", 2, "--steps", 64, "--minibatch-size", 64, "--epochs", 2]
+    flags += ["--ray", "--learners", 2, "--compile", "off", "--eval-every", 0, "--eval-episodes", 1]
+    try:
+        pgkit("run", "ppo", *flags, "--total-frames", 256, "--run-dir", tmp_path / "run")
+    finally:
+        ray.shutdown()
+    frames = [(row["frames"], row["train/epochs"]) for row in rows(tmp_path / "run")]
+    assert frames == [("128", "2.0"), ("256", "2.0")]
+    loaded = run.load_agent(tmp_path / "run")
+    assert loaded.normalizer.count == 256  # of all environments

@@ -102,6 +102,11 @@ def test_bounds_are_inclusive_and_none_passes():
             within(low, high, a=value)
 
 
+@pytest.mark.fault(
+    kind=32,
+    injected="a second phase with an update of its own, after the first has moved the weights",
+    outcome="no warning about another policy; a rollout of another actor gets one",
+)
 def test_a_batch_of_another_policy_is_said_but_not_of_one_that_an_earlier_phase_has_trained(caplog):
     critic = modules.state_value(ENV, (8,))
 

@@ -1,6 +1,7 @@
 """Who may import whom: docs/house.md as a test."""
 
 import ast
+import re
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -104,6 +105,36 @@ def circles(files: list[Path]):
 
 def test_no_two_files_import_each_other():
     assert len(list(circles(list(PGKIT.rglob("*.py"))).static_order())) > 100
+
+
+def functions(path: Path):
+    """Every function of a file."""
+    kinds = (ast.FunctionDef, ast.AsyncFunctionDef)
+    yield from (node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, kinds))
+
+
+def body_lines(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
+    """Lines of a function without its signature and docstring."""
+    body = function.body[1:] if ast.get_docstring(function) is not None else function.body
+    return (body[-1].end_lineno or 0) - body[0].lineno + 1 if body else 0
+
+
+def test_no_function_body_has_more_than_40_lines():
+    long = {f"{path}: {f.name}": body_lines(f) for path in PGKIT.rglob("*.py") for f in functions(path)}
+    assert not {name: lines for name, lines in long.items() if lines > 40}
+    assert max(long.values()) > 20  # they are counted
+
+
+def test_neighbours_are_seldom_asked_what_they_have():
+    asked = re.compile(r"\b(?:hasattr|getattr)\(")
+    assert 0 < sum(len(asked.findall(path.read_text())) for path in PGKIT.rglob("*.py")) <= 40
+
+
+def test_private_torch_lives_in_two_folders():
+    private = re.compile(r"\btorch\.(?:utils\.)?_(?!_)\w|\baten\._\w")
+    found = {path.relative_to(PGKIT).as_posix() for path in PGKIT.rglob("*.py") if private.search(path.read_text())}
+    found = {name for name in found if name.split("/")[0] not in ("compiled", "optim")}
+    assert found == {"modules/ensemble.py"}  # whether vmap hides a parameter: torch has no public way to ask
 
 
 def test_the_table_is_enforced(tmp_path):

@@ -15,6 +15,7 @@ from torch import Tensor
 from pgkit.errors import UserError, within
 from pgkit.functional import listed
 from pgkit.functional import standardize as over_all
+from pgkit.functional.modes import in_evaluation
 
 Keys = NestedKey | list[NestedKey]
 
@@ -24,6 +25,8 @@ class Advantage(TensorDictModuleBase):
 
     A subclass says in :meth:`estimate` what they are. In one call, the critic reads every observation, and besides only
     the true final observations of episodes and the rollout's last: elsewhere the next value is the value one step on.
+
+    The critic is read in evaluation mode (no dropout, normalization by running statistics).
 
     **Many agents**: with a critic that writes ``("agents", "state_value")``, ``[*B, T, agents, 1]``, the results lie
     under the same name and have the same shape. Reward and flags are the group's own where the rollout has them, else
@@ -122,12 +125,15 @@ class Advantage(TensorDictModuleBase):
     @torch.no_grad()
     def forward(self, rollout: TensorDictBase) -> TensorDictBase:
         """Reads and returns ``rollout``, which has time as its last batch dimension."""
+        if not rollout.batch_size.numel():
+            raise UserError(f"{type(self).__name__} got an empty rollout {list(rollout.batch_size)}: give it steps")
         keys, time = self.tensor_keys, rollout.batch_dims - 1
         scale = 1.0 if self.return_scale is None else self.return_scale.scale
         if self.critic is None:
             value = next_value = torch.zeros_like(self._after(keys.reward, rollout))
         else:
-            value, next_value = self._values(self.critic, rollout)
+            with in_evaluation(self.critic):
+                value, next_value = self._values(self.critic, rollout)
             rollout.set(keys.value, value)
         values = ((x * scale).movedim(time, -2) for x in (value, next_value))
         advantage, target = (x.movedim(-2, time) for x in self.estimate(*values, rollout))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDictBase
@@ -103,7 +103,7 @@ class GroupRelative(Advantage):
         mask = rollout[COMPLETION] & live.unsqueeze(-1)
         rollout.set(COMPLETION, mask).set(LOG_PROBS, torch.where(mask, rollout[LOG_PROBS], 0.0))
         count = max(1, -(-int(live.sum()) // self.multiple)) * self.multiple
-        return rollout[live.int().argsort(descending=True, stable=True)[:count]]
+        return cast(TensorDictBase, rollout[live.int().argsort(descending=True, stable=True)[:count]])
 
 
 KINDS = {

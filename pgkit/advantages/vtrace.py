@@ -14,6 +14,7 @@ from torch import Tensor
 from pgkit.advantages.base import Advantage, Keys, as_values
 from pgkit.errors import within
 from pgkit.functional import listed, same_shape, vtrace
+from pgkit.functional.modes import in_evaluation
 
 
 class VTrace(Advantage):
@@ -73,7 +74,8 @@ class VTrace(Advantage):
 
     def estimate(self, value: Tensor, next_value: Tensor, rollout: TensorDictBase) -> tuple[Tensor, Tensor]:
         if self.actor is not None:
-            dist = self.actor.get_dist(rollout.select(*self.actor.in_keys))
+            with in_evaluation(self.actor):
+                dist = self.actor.get_dist(rollout.select(*self.actor.in_keys))
             composite = isinstance(dist, CompositeDistribution)
             with set_composite_lp_aggregate(True):
                 actions = rollout if composite else rollout[self.actor.dist_sample_keys[0]]

@@ -4,6 +4,6 @@ from pgkit.checks.assembly import assembly
 from pgkit.checks.diagram import diagram
 from pgkit.checks.keys import is_loss
 from pgkit.checks.settings import check_settings
-from pgkit.checks.view import LossView
+from pgkit.checks.view import LossView, result_of
 
-__all__ = ["LossView", "assembly", "check_settings", "diagram", "is_loss"]
+__all__ = ["LossView", "assembly", "check_settings", "diagram", "is_loss", "result_of"]

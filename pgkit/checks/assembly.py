@@ -14,7 +14,7 @@ from torch.utils.weak import WeakTensorKeyDictionary
 from pgkit.checks import entries, explain, owners, rollouts
 from pgkit.checks.broadcasts import BroadcastError, NoBroadcasts
 from pgkit.checks.keys import is_loss
-from pgkit.checks.view import LossView, untouched
+from pgkit.checks.view import LossView, result_of
 from pgkit.errors import UserError
 
 _SEEN = WeakTensorKeyDictionary()  # parameters of the actors that an update has looked at, and may have trained since
@@ -35,6 +35,8 @@ def assembly(
     loss raises, traced to the entry, who writes it and who reads it; the loss's result; action kind and bounds; the
     optimizer's parameters. It warns where another policy seems to have collected.
 
+    The loss's statistics and the random generators may move: an update undoes that.
+
     Args:
         view: the loss, the advantage block, and who hands the batch over.
         optimizer: of all that is trained.
@@ -51,13 +53,12 @@ def assembly(
     rollouts.check_one_memory(view)
     owners.check_discounts(view, owners_of_gamma or {})
     entries.check_form(view, batch)
-    with untouched([*view.loss.parameters(), *view.loss.buffers()]):  # a forward pass may update statistics
-        out = _trial(view, batch)
-        _check_result(view, batch, out)
-        entries.check_action(view, batch)
-        total = torch.stack([out[key].sum() for key in out.keys() if is_loss(key)]).sum()
-        owners.check_parameters(view, optimizer, total)
-        _warn_of_another_policy(view, batch, resumed)
+    out = _trial(view, batch)
+    _check_result(view, batch, out)
+    entries.check_action(view, batch)
+    total = torch.stack([out[key].sum() for key in out.keys() if is_loss(key)]).sum()
+    owners.check_parameters(view, optimizer, total)
+    _warn_of_another_policy(view, batch, resumed)
     return [key for key in out.keys() if out[key].numel() == 1]
 
 
@@ -80,15 +81,15 @@ def _trial(view: LossView, batch: TensorDictBase) -> TensorDictBase:
 def _without_broadcasts(view: LossView, batch: TensorDictBase) -> TensorDictBase:
     try:
         with NoBroadcasts(view.name):
-            return view.loss(batch.copy())
+            return result_of(view.loss, batch.copy())
     except BroadcastError as error:
         entries.check_action(view, batch)
         try:
             with NoBroadcasts(view.name):  # with fewer rows, as a network may have as many features
-                view.loss(batch[:-1])
+                result_of(view.loss, batch[:-1])
         except BroadcastError:
             raise error from None
-        return view.loss(batch.copy())
+        return result_of(view.loss, batch.copy())
 
 
 def _check_result(view: LossView, batch: TensorDictBase, out: Any) -> None:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Callable
 from dataclasses import fields
 from functools import partial
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDictBase, is_tensorclass
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictParams
 from torch import Tensor, nn
 from torchrl.objectives import LossModule
@@ -217,6 +216,12 @@ class LossView:
         return rollout
 
 
+def result_of(loss: nn.Module, batch: TensorDictBase) -> Any:
+    """What the loss returns for a batch; TorchRL's ``GRPOLoss`` has a class of its own for a TensorDict."""
+    out = loss(batch)
+    return out.to_tensordict() if is_tensorclass(out) else out
+
+
 def name_of(block: Any) -> str:
     """What a message calls a block: a function by its own name, any other by its class."""
     while isinstance(block, partial):
@@ -237,8 +242,7 @@ def shape_of(data: TensorDictBase) -> str:
 
 def bounds(dist: Any) -> tuple[Any, Any]:
     """Least and greatest action of a distribution, as far as it knows them; else None."""
-    low, high = getattr(dist, "low", None), getattr(dist, "high", None)
-    logits = getattr(dist, "logits", None)
+    low, high, logits = (getattr(dist, name, None) for name in ("low", "high", "logits"))
     if low is None and logits is not None and not dist.sample().is_floating_point():
         return 0, logits.shape[-1] - 1
     return low, high
@@ -248,26 +252,9 @@ def run(net: Any, params: Any, call: Callable[[], Any]) -> Any:
     """``call()`` with ``params`` in ``net``, without gradients and without a trace."""
     held = list(params.values(True, True))
     copies = params.apply(lambda x: x if isinstance(x, nn.Parameter) else x.clone())  # statistics may move in these
-    with torch.no_grad(), same_random_numbers(held), copies.to_module(net, preserve_module_state=False):
+    cards = list({tensor.device for tensor in held if tensor.is_cuda})
+    with torch.no_grad(), torch.random.fork_rng(devices=cards), copies.to_module(net, preserve_module_state=False):
         return call()
-
-
-def same_random_numbers(tensors: Sequence[Tensor]) -> AbstractContextManager[None]:
-    """What is drawn within, on the CPU and on the devices of these tensors, does not move the random generators."""
-    return torch.random.fork_rng(devices=list({tensor.device for tensor in tensors if tensor.is_cuda}))
-
-
-@contextmanager
-def untouched(tensors: Sequence[Tensor]) -> Iterator[None]:
-    """What happens within to those of the tensors that are no parameters, and to random generators, is undone."""
-    before = [(tensor, tensor.detach().clone()) for tensor in tensors if not isinstance(tensor, nn.Parameter)]
-    try:
-        with same_random_numbers(tensors):
-            yield
-    finally:
-        with torch.no_grad():
-            for tensor, value in before:
-                tensor.copy_(value)
 
 
 def keys_of(block: Any, name: str) -> list[Any]:

@@ -62,7 +62,7 @@ def parser() -> Parser:
     command.add_argument("flags", nargs=argparse.REMAINDER, help="the recipe's own").required = False
     command.set_defaults(command=run_recipe)
 
-    policies.add(commands, positive)
+    policies.add(commands, positive, seed)
 
     command = commands.add_parser("plot", help="draw the learning curves of runs; seeds are averaged")
     command.add_argument("run_dirs", type=Path, nargs="+", metavar="RUN_DIR")
@@ -73,14 +73,21 @@ def parser() -> Parser:
         "--x", choices=["frames", "wall"], default="frames", help="axis: frames, or minutes of training"
     )
     command.set_defaults(command=plot_runs)
-    studies.add(commands)
+    studies.add(commands, positive)
     return top
 
 
 def positive(text: str) -> int:
-    """An int of at least 1."""
-    if (value := int(text)) < 1:
-        raise argparse.ArgumentTypeError(f"{text} is not a positive number")
+    """A whole number from 1 to a million."""
+    if not 1 <= (value := int(text)) <= 10**6:
+        raise argparse.ArgumentTypeError(f"{text:.30} is not a positive number up to 1,000,000")
+    return value
+
+
+def seed(text: str) -> int:
+    """A seed of environments."""
+    if not 0 <= (value := int(text)) < 2**62:
+        raise argparse.ArgumentTypeError(f"{text:.30}: give a whole number from 0 to 2^62")
     return value
 
 

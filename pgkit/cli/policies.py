@@ -12,12 +12,12 @@ from typing import Any
 from pgkit.errors import UserError
 
 
-def add(commands: Any, positive: Callable[[str], int]) -> None:
+def add(commands: Any, positive: Callable[[str], int], seed: Callable[[str], int]) -> None:
     """Adds the two commands to the grammar of ``pgkit``."""
     command = commands.add_parser("eval", help="play whole episodes with a trained policy")
     _which_policy(command)
     command.add_argument("--episodes", type=positive, default=10, help="how many (default: 10)")
-    command.add_argument("--seed", type=int, default=0, help="of the envs (default: 0)")
+    command.add_argument("--seed", type=seed, default=0, help="of the envs (default: 0)")
     command.add_argument("--video", type=Path, metavar="FILE.mp4", help="record the episodes; .gif needs no codec")
     command.set_defaults(command=evaluate_run)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import ast
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from pgkit.cli import recipes
 from pgkit.errors import UserError
 
 
-def add(commands: Any) -> None:
+def add(commands: Any, positive: Callable[[str], int]) -> None:
     """Adds the three commands to the grammar of ``pgkit``."""
     command = commands.add_parser(
         "experiment",
@@ -22,7 +23,7 @@ def add(commands: Any) -> None:
     command.add_argument("recipe", help="a name that pgkit ls shows, or a file")
     command.add_argument("--envs", nargs="+", required=True, metavar="ENV", help="environment ids")
     command.add_argument("--seeds", default="1-3", help="such as 1-5 or 1,3,7 (default: 1-3)")
-    command.add_argument("--jobs", type=int, default=1, help="runs at a time, one thread each (default: 1)")
+    command.add_argument("--jobs", type=positive, default=1, help="runs at a time, one thread each (default: 1)")
     command.add_argument("--dir", type=Path, help="where the runs go (default: runs/experiments/RECIPE)")
     command.add_argument("--out", type=Path, help="results table, extended where it exists (default: DIR/results.csv)")
     command.set_defaults(command=run_experiment, takes_flags=True)
@@ -43,7 +44,7 @@ def add(commands: Any) -> None:
     )
     command.add_argument("recipe", help="a name that pgkit ls shows, or a file with a SEARCH space")
     command.add_argument("--env-id", required=True, help="environment id")
-    command.add_argument("--trials", type=int, default=20, help="how many (default: 20)")
+    command.add_argument("--trials", type=positive, default=20, help="how many (default: 20)")
     command.add_argument("--seeds", default="101,102", help="seeds that no table uses (default: 101,102)")
     command.add_argument("--dir", type=Path, help="where trials are kept (default: runs/tune/RECIPE-ENV)")
     command.set_defaults(command=run_tune, takes_flags=True)
@@ -53,8 +54,6 @@ def run_experiment(args: argparse.Namespace) -> None:
     from pgkit.run import experiment
 
     recipes.find(args.recipe)
-    if args.jobs < 1:
-        raise UserError(f"--jobs {args.jobs}: give at least 1")
     folder = args.dir or Path("runs/experiments") / Path(args.recipe).stem
     cells = experiment.cells(args.recipe, args.envs, experiment.seeds(args.seeds), args.flags, folder)
     table, failed = args.out or folder / "results.csv", []

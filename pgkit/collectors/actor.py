@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -15,7 +16,7 @@ from torchrl.modules import OrnsteinUhlenbeckProcessModule
 
 from pgkit.envs import VectorEnv
 from pgkit.errors import UserError
-from pgkit.seams import Entries, Key, Memory
+from pgkit.seams import Entries, Key, Memory, Noisy
 
 
 def state_of(actor: torch.nn.Module) -> tuple[Key, Sequence[int]] | None:
@@ -60,6 +61,22 @@ def memory(actor: TensorDictModuleBase, num_envs: int, device: torch.device | No
     return {"is_init": is_init, key: torch.zeros(num_envs, *shape, device=device)}
 
 
+@contextmanager
+def acting(actor: torch.nn.Module) -> Iterator[None]:
+    """The mode in which a policy acts: evaluation, so that no statistic moves and no dropout draws.
+
+    Layers of noise (those with ``reset_noise``, such as ``NoisyLinear``) explore, and stay in training mode.
+    """
+    modes = [(part, part.training) for part in actor.modules()]
+    for part, _ in modes:
+        part.training = isinstance(part, Noisy)
+    try:
+        yield
+    finally:
+        for part, mode in modes:
+            part.training = mode
+
+
 def example(env: VectorEnv, actor: TensorDictModuleBase) -> Entries:
     """The actor's outputs for observations of zeros, by key, checked against the environment's action spec."""
     keys, entries, device = output_keys(actor), env.observation_spec.zero(), env.observation_spec.device
@@ -77,7 +94,7 @@ def example(env: VectorEnv, actor: TensorDictModuleBase) -> Entries:
         )
     check_types(actor, data)
     misfit = "the actor was built for another environment: build it from this one (modules.gaussian_actor(env))"
-    with torch.no_grad(), torch.random.fork_rng(), set_exploration_type(ExplorationType.RANDOM):
+    with torch.no_grad(), acting(actor), torch.random.fork_rng(), set_exploration_type(ExplorationType.RANDOM):
         try:
             out = actor(data.to(device_of(actor, env)))
         except RuntimeError as error:

@@ -9,7 +9,8 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils._python_dispatch import TorchDispatchMode
+
+from pgkit.compiled import Instead
 
 Kind = Literal["normal", "uniform", "exponential"]
 Function = Callable[..., tuple[Tensor, ...]]
@@ -104,7 +105,7 @@ def census(function: Function, inputs: Sequence[Tensor], rows: int) -> list[Draw
         return torch.full(draw.shape, 0.5, dtype=dtype, device=device)
 
     try:
-        with _Drawing(give):
+        with _drawing(give):
             function(*inputs)
     except Unsupported:
         return None
@@ -122,7 +123,7 @@ def fed(function: Function, inputs: int) -> Function:
                 raise RuntimeError("the policy draws other random numbers than in its first step")
             return noise.pop(0)
 
-        with _Drawing(give):
+        with _drawing(give):
             return function(*given[:inputs])
 
     return act
@@ -131,21 +132,19 @@ def fed(function: Function, inputs: int) -> Function:
 Give = Callable[[Kind, Sequence[int], torch.dtype, torch.device], Tensor]
 
 
-class _Drawing(TorchDispatchMode):
-    """Every random operation of torch takes its numbers from ``give``."""
+def _drawing(give: Give) -> Instead:
+    """Within it, every random operation of torch takes its numbers from ``give``."""
 
-    def __init__(self, give: Give) -> None:
-        super().__init__()
-        self._give = give
-
-    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        if torch.Tag.nondeterministic_seeded not in func.tags:
-            return func(*args, **(kwargs or {}))
-        rule = _RULES.get(func.overloadpacket)
+    def draw(operation: Any, *args: Any, **kwargs: Any) -> Any:
+        if torch.Tag.nondeterministic_seeded not in operation.tags:
+            return operation(*args, **kwargs)
+        rule = _RULES.get(operation.overloadpacket)
         if rule is None:
-            raise Unsupported(f"{func}")
-        settings = {key: x for key, x in (kwargs or {}).items() if key in ("dtype", "device") and x is not None}
-        return rule(_Source(self._give, settings), *args)
+            raise Unsupported(f"{operation}")
+        settings = {key: x for key, x in kwargs.items() if key in ("dtype", "device") and x is not None}
+        return rule(_Source(give, settings), *args)
+
+    return Instead(draw)
 
 
 class _Source:

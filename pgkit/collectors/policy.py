@@ -15,14 +15,14 @@ from torch.overrides import TorchFunctionMode
 from torchrl.data import Composite, MultiCategorical, TensorSpec
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from pgkit.collectors.actor import is_state, output_keys
+from pgkit.collectors.actor import acting, is_state, output_keys
 from pgkit.collectors.noise import Streams, census, fed
 from pgkit.compiled import Compiled, Mode, compiled, undone
 from pgkit.envs.seeding import episode_seed
 from pgkit.seams import Entries, Key
 
 Act = Callable[..., Sequence[Tensor]]
-LEAST_ROWS = 4  # matrix products and convolutions of fewer rows round differently
+LEAST_ROWS, LEAST_IMAGES = 16, 4  # matrix products, and convolutions, of fewer rows round differently
 
 
 def function_of(actor: TensorDictModuleBase, keys: Sequence[Key]) -> Act:
@@ -31,7 +31,7 @@ def function_of(actor: TensorDictModuleBase, keys: Sequence[Key]) -> Act:
 
     def act(*inputs: Tensor) -> tuple[Tensor, ...]:
         data = TensorDict(dict(zip(keys, inputs, strict=True)), batch_size=inputs[0].shape[:1])
-        with set_exploration_type(ExplorationType.RANDOM):
+        with acting(actor), set_exploration_type(ExplorationType.RANDOM):
             out = actor(data)
         return tuple(out[key] for key in outputs)
 
@@ -78,18 +78,22 @@ def choices(spec: TensorSpec, mask: Tensor) -> Sequence[Tensor]:
     return mask.split(spec.nvec.reshape(-1, spec.shape[-1])[0].tolist(), -1)
 
 
-def padded_rows(rows: int, num_envs: int) -> int:
-    """Rows that a policy is evaluated on for ``rows`` environments of ``num_envs``."""
-    return max(rows, min(LEAST_ROWS, num_envs))
+def padded_rows(inputs: Sequence[Tensor], num_envs: int) -> int:
+    """Rows that a policy is evaluated on for inputs ``[rows, ...]`` of some of ``num_envs`` environments."""
+    return max(len(inputs[0]), min(_least_rows(inputs), num_envs))
+
+
+def _least_rows(inputs: Sequence[Tensor]) -> int:
+    return LEAST_IMAGES if any(x.dtype is torch.uint8 and x.dim() > 2 for x in inputs) else LEAST_ROWS
 
 
 class RowPolicy:
     """A policy for ``rows`` environments of a larger vector, whose results are those it has for all of them at once.
 
     Random numbers come from a stream for each environment (:class:`~pgkit.collectors.noise.Streams`), and fewer rows
-    than four are padded, so that neither depends on which environments this process has. (Of vectors with fewer than
-    four environments, each keeps its place, too.) Where the policy's random numbers cannot be replaced, torch's
-    generator is seeded for each rollout and share, and the log says so.
+    than sixteen (of images: four) are padded, so that neither depends on which environments this process has. Where
+    the policy's random numbers cannot be replaced, torch's generator is seeded for each rollout and share, and the
+    log says so.
 
     Args:
         act: function of tensors ``[rows, ...]``.
@@ -112,8 +116,8 @@ class RowPolicy:
         mode: Mode = "off",
     ) -> None:
         self._seed, self._first, rows = seed, first, len(inputs[0])
-        all_rows = padded_rows(rows, num_envs)
-        before = first if num_envs < LEAST_ROWS else 0
+        all_rows = padded_rows(inputs, num_envs)
+        before = min(first % _least_rows(inputs), all_rows - rows)  # the place of a row matters, too
         self._own = slice(before, before + rows)
         self._padded = [x.new_zeros(all_rows, *x.shape[1:]) for x in inputs] if all_rows > rows else None
         inputs = self._padded or [x.clone() for x in inputs]

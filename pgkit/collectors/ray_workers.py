@@ -24,7 +24,7 @@ from pgkit.collectors.stepping import Share, allocate, regroup
 from pgkit.collectors.workers import WorkerEnded, shares
 from pgkit.compiled import Mode, load_matmul_state, matmul_state
 from pgkit.envs import VectorEnv
-from pgkit.errors import UserError
+from pgkit.errors import EnvironmentFailed, UserError
 from pgkit.seams import Entries, MakeSimulator
 
 _TICK = 0.5  # seconds between looks at what is slow to come
@@ -161,8 +161,12 @@ class RayWorkers:
             return True
         for ref in self._ray.wait(list(pending), num_returns=len(pending), timeout=timeout)[0]:
             self._take(pending[ref], ref)
-        missing = [i for i, ref in enumerate(self._refs) if ref is not None]
-        self._waiting.go_on([self._there[i] for i in missing], timeout=0)
+        missing = [self._there[i] for i, ref in enumerate(self._refs) if ref is not None]
+        try:
+            self._waiting.go_on(missing, timeout=0)
+        except UserError:
+            self.close()
+            raise
         return not missing
 
     def _take(self, i: int, ref: Any) -> None:
@@ -173,7 +177,7 @@ class RayWorkers:
             self._refs[i], self._asked[i], self._deaths[i] = None, None, 0
         except errors.RayTaskError as error:
             self.close()
-            if isinstance(error.cause, UserError):
+            if isinstance(error.cause, UserError | EnvironmentFailed):
                 raise error.cause from None
             raise RuntimeError(f"collecting process {i} failed:\n{error.traceback_str}") from None
         except gone as error:

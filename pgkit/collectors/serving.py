@@ -43,7 +43,6 @@ class Order(NamedTuple):
     buffers: Entries
     compile: Mode
     matmul: dict[str, Any]
-    tells_state: bool
     temporary: str
 
 
@@ -75,14 +74,15 @@ def _answer(pipe: Connection, order: Order) -> None:
         pipe.send((None, None))
         while True:
             request, argument = pipe.recv()
-            answer = None
+            tells = request == "state"
             if request == "collect":
-                share.collect(*argument)
+                step, random, tells = argument
+                share.collect(step, random)
             elif request == "load":
                 share.load_state_dict(pickle.loads(argument))
-            if request == "state" or (request == "collect" and order.tells_state):
-                answer = pickle.dumps(share.state_dict())
-            pipe.send((answer, None))
+            elif request == "rebuild":
+                share.rebuild(pickle.loads(argument))
+            pipe.send((pickle.dumps(share.state_dict()) if tells else None, None))
 
 
 def _leave_to_the_parent(*_: Any) -> None: ...

@@ -15,12 +15,13 @@ from torch import Tensor
 from pgkit.collectors.actor import is_state, memory, path_of
 from pgkit.collectors.policy import RowPolicy, choices, function_of, padded_rows, random_actions
 from pgkit.collectors.rebuild import Past
-from pgkit.compiled import Mode
+from pgkit.compiled import Mode, copy_all
 from pgkit.envs import VectorEnv
 from pgkit.errors import UserError
 from pgkit.seams import Entries, Key, Simulator
 
 MASK: Key = ("collector", "mask")
+LARGEST = 1e18  # of observations and rewards: squared it is still finite in float32
 
 
 def allocate(steps: int, env: VectorEnv, outputs: Entries) -> Entries:
@@ -80,7 +81,7 @@ class Share:
         self._next = _rows(counted, [("next", *_path(key)) for key in self._after()])
         self._mask = buffers[MASK].unbind(0) if simulator.masks else None
         spec = simulator.action_spec
-        padded = padded_rows(simulator.num_envs, num_envs)
+        padded = padded_rows(self._now[0], num_envs)
         random = random_actions(spec if padded == spec.shape[0] else _padded(spec, padded), self._keys, outputs)
         self._random = RowPolicy(random, self._now[0], num_envs, first, seed)
         self.retrace(actor, mode)
@@ -114,11 +115,11 @@ class Share:
             for now, decided, after, drawn, t in zip(
                 self._now, self._decided, self._next, noise, range(self._steps), strict=True
             ):
-                torch._foreach_copy_(now, [*[fresh[key] for key in observed], *remembered.values()])
+                copy_all(now, [*[fresh[key] for key in observed], *remembered.values()])
                 outputs = policy(now, drawn)
-                torch._foreach_copy_(decided, outputs)
+                copy_all(decided, outputs)
                 made = simulator.step({key: outputs[at] for key, at in actions})
-                torch._foreach_copy_(after, [
+                copy_all(after, [
                     *[made.next[key] for key in observed], *made.reward.values(), *made.terminated.values(),
                     *made.truncated.values(), *made.info.values(), *simulator.episode_reward.values(),
                     simulator.step_count,
@@ -232,14 +233,18 @@ def _check(tensors: dict[Any, Tensor], env: VectorEnv) -> None:
 
 
 def _check_finite(x: Tensor, key: Key) -> None:
-    if x.dtype.is_floating_point and not torch.isfinite(x).all():
-        row, step = (~torch.isfinite(x)).nonzero()[0, :2].tolist()
-        found = x[row, step][~torch.isfinite(x[row, step])].flatten()[0].item()
-        name = ".".join(_path(key))
-        raise UserError(
-            f"'{name}' of environment {row} is {found} at step {step} of the rollout: the update would turn every "
-            "weight into NaN; mend the environment, or clip it in a wrapper (gymnasium.wrappers.TransformObservation)"
-        )
+    if not x.dtype.is_floating_point or not x.numel():
+        return
+    low, high = x.aminmax()  # NaN where one is
+    if low >= -LARGEST and high <= LARGEST:
+        return
+    wrong = ~(x.abs() <= LARGEST)
+    row, step = wrong.nonzero()[0, :2].tolist()
+    found, name = x[row, step][wrong[row, step]].flatten()[0].item(), ".".join(_path(key))
+    raise UserError(
+        f"'{name}' of environment {row} is {found:g} at step {step} of the rollout: the update would turn every "
+        "weight into NaN; mend the environment, or clip it in a wrapper (gymnasium.wrappers.TransformObservation)"
+    )
 
 
 def _rows(buffers: Entries, keys: Iterable[Key]) -> list[list[Tensor]]:

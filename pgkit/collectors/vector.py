@@ -29,7 +29,9 @@ class VectorCollector:
     The numbers depend on the environment's seed and the weights only: not on ``env.workers``, not on the use made
     of torch's global random generator elsewhere.
 
-    The policy is evaluated where the environments are; a rollout is brought to where the actor is, as a whole.
+    The policy acts in evaluation mode, whatever mode it is in: no dropout, and normalization by running statistics,
+    which stay as they are. It is evaluated where the environments are; a rollout is brought to where the actor is, as a
+    whole.
 
     Args:
         env: from :func:`pgkit.envs.make`; ``env.workers`` processes collect. Or any TorchRL environment with one batch
@@ -151,7 +153,8 @@ class VectorCollector:
             self._workers = None
         if self._workers is None:
             start = time.perf_counter()
-            self._constants, self._beside = Constants({"the actor": self.actor}), Beside(self.actor, self.env)
+            self._constants = Constants({"the actor": self.actor}, but={"training"})
+            self._beside = Beside(self.actor, self.env)
             self._workers = self._make_pool(self.env, self._beside.actor, self._steps, self._outputs, self._compile)
             self.compile_seconds += time.perf_counter() - start
             if state is not None:
@@ -162,7 +165,7 @@ class VectorCollector:
         """All environments in this process; the policy is recorded again where something that it holds was replaced."""
         if self._share is None or self._constants is None or self._constants.changed():
             start = time.perf_counter()
-            self._constants = Constants({"the actor": self.actor})
+            self._constants = Constants({"the actor": self.actor}, but={"training"})
             self._beside = Beside(self.actor, self.env)
             if self._share is None:
                 self._buffers = allocate(self._steps, self.env, self._outputs)

@@ -19,6 +19,7 @@ import torch.multiprocessing as mp
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
+from pgkit.collectors.rebuild import Known
 from pgkit.collectors.serving import Order, Request, how_it_ended, serve, spared, stop
 from pgkit.collectors.stepping import allocate, lost, regroup
 from pgkit.compiled import Mode, matmul_state
@@ -64,9 +65,9 @@ class Workers:
     The rollout and the policy's weights are in shared memory: a rollout costs two messages a process. Each process
     evaluates the policy on its own rows only.
 
-    With ``env.restart_workers``, a process that has ended or hangs is replaced: the new one gets the state of its
-    environments as of the last rollout, and collects this one again, to the same numbers. Where it ends again, its
-    environments begin new episodes; the third time is an error.
+    With ``env.restart_workers``, a process that has ended or hangs is replaced: the new one takes the actions again
+    that were taken until the last rollout (:class:`Known`), and collects this one again, to the same numbers. Where it
+    ends again, its environments begin new episodes; the third time is an error.
 
     Args:
         env: all the environments.
@@ -100,7 +101,7 @@ class Workers:
             Order(
                 make, first, end - first, env.num_envs, env.seed, self._actor, outputs,
                 {key: x[:, first:end] for key, x in self._buffers.items()}, compile, matmul_state(),
-                env.restart_workers, get_temp_dir(),
+                get_temp_dir(),
             )
             for first, end in pairwise(self._bounds)
         ]  # fmt: skip
@@ -109,7 +110,8 @@ class Workers:
         # at the interpreter's end before multiprocessing waits for its processes, which do not heed its SIGTERM
         self.close = Finalize(self, stop, (self.pipes, self._processes), exitpriority=10)
         self._asked: list[Request | None] = [None] * len(self._orders)  # whose answer is not read yet
-        self._states: list[bytes | None] = [None] * len(self._orders)  # as of the last rollout, if any is replaced
+        pasts = pairwise(self._bounds) if env.restart_workers else ()
+        self._known = [Known(env, end - first, outputs) for first, end in pasts]  # where processes are replaced
         try:
             for i in range(len(self._orders)):
                 self._start(i)
@@ -151,7 +153,8 @@ class Workers:
             self._buffers[STEPS].fill_(-1)  # shows how far a process has come
         self._step = step
         for i in range(len(self.pipes)):
-            self._send(i, ("collect", (step, random)))
+            tells = bool(self._known) and self._known[i].asks()
+            self._send(i, ("collect", (step, random, tells)))
 
     def ready(self) -> bool:
         """Whether :meth:`finish` would not wait."""
@@ -168,12 +171,19 @@ class Workers:
 
     def state_dict(self) -> list[dict[str, Any]]:
         """The state of every process's share."""
-        return [pickle.loads(state) for state in self._ask([("state", None)] * len(self.pipes))]
+        states = self._ask([("state", None)] * len(self.pipes))
+        self._tell(states)
+        return [pickle.loads(state) for state in states]
 
     def load_state_dict(self, states: list[dict[str, Any]]) -> None:
         """Gives every process its share of :meth:`state_dict`, taken with any number of processes."""
-        self._states = [pickle.dumps(state) for state in regroup(states, self._bounds)]
-        self._ask([("load", state) for state in self._states])
+        parts = [pickle.dumps(state) for state in regroup(states, self._bounds)]
+        self._tell(parts)
+        self._ask([("load", state) for state in parts])
+
+    def _tell(self, states: list[bytes]) -> None:
+        for known, state in zip(self._known, states, strict=False):
+            known.told(state)
 
     def _ask(self, requests: list[Request]) -> list[Any]:
         self._answers()
@@ -222,8 +232,8 @@ class Workers:
             raise RuntimeError(f"collector worker {i} failed:\n{failure}")
         if failure is not None:
             raise failure
-        if self._collects(i) and self._env.restart_workers:
-            self._states[i] = answer
+        if self._collects(i) and self._known:
+            self._known[i].collected(self._orders[i].buffers, answer)
         self._asked[i] = None
         return answer
 
@@ -245,11 +255,12 @@ class Workers:
             "%s; a new process takes its place: its environments %s", ended.line,
             f"begin new episodes ({self.episodes_lost:,} lost so far)" if anew else "go on where they were",
         )  # fmt: skip
-        state = pickle.dumps(lost(self._step)) if anew else self._states[i]
+        if anew:
+            self._known[i].told(pickle.dumps(lost(self._step)))
         self._processes[i].kill()
         self.pipes[i].close()
         self._start(i)
-        for request in (asked,) if state is None else (("load", state), asked):
+        for request in (("rebuild", pickle.dumps(self._known[i].past)), asked):
             self._receive(i)
             self._send(i, request)
 

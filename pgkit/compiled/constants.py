@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from functools import partial
 from types import BuiltinFunctionType, FunctionType, MethodType
 from typing import Any
@@ -29,10 +29,16 @@ class Constants:
 
     Args:
         watched: modules or functions, each under what a message calls it.
+        but: names of attributes that may change.
     """
 
-    def __init__(self, watched: Mapping[str, Any]) -> None:
-        slots = [(f"in {owner} '{name}'", read) for owner, held in watched.items() for name, read in _slots_of(held)]
+    def __init__(self, watched: Mapping[str, Any], but: Collection[str] = ()) -> None:
+        slots = [
+            (f"in {owner} '{name}'", read)
+            for owner, held in watched.items()
+            for name, read in _slots_of(held)
+            if name.rpartition(".")[2] not in but
+        ]
         slots = [(name, read) for name, read in slots if (value := read()) is None or isinstance(value, _KEPT)]
         self._names, self._reads = [name for name, _ in slots], [read for _, read in slots]
         self._values = [read() for read in self._reads]

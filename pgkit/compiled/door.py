@@ -5,12 +5,13 @@ from __future__ import annotations
 import shutil
 import time
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from logging import INFO, WARNING, getLogger
+from logging import DEBUG, INFO, WARNING, getLogger
 from typing import Any, Literal, cast
 
+import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
@@ -76,9 +77,11 @@ class Compiled:
             it is. ``off``: as it is.
         name: what the log calls it: ``the update``.
         holds: further tensors that it changes or that change in place: optimizer state, priorities, a cache.
+        but: names of attributes whose changes say nothing.
         agree: whether all of several learners took a rung, from whether this one did.
         most: operations that are worth compiling, of a function that may be a long loop; it skips ``torch.compile``.
-        fixed: refuses a record in which values decide how many elements something has.
+        fixed: refuses a record in which values decide how many elements something has, and to run the function as it
+            is: a ``UserError`` then, in every mode but ``off``.
 
     Attributes:
         seconds: spent recording and compiling so far.
@@ -93,6 +96,7 @@ class Compiled:
     holds: Sequence[Tensor] = ()
     agree: Callable[[bool], bool] = bool
     most: int | None = None
+    but: Collection[str] = ()
     fixed: bool = False
     seconds: float = field(default=0.0, init=False)
     rung: str = field(default=EAGER, init=False)
@@ -131,7 +135,7 @@ class Compiled:
         failed: list[str] = []
         last: Exception | None = None
         for rung in _LADDERS[self.mode]:
-            if rung == TRACED and self.most is not None:
+            if (rung == TRACED and self.most is not None) or (rung == EAGER and self.fixed):
                 continue
             self.rung = rung
             bind = None
@@ -159,7 +163,7 @@ class Compiled:
             return lambda data: partial(self.function, data)
         held = list({id(x): x for x in (*tensors_of(self.watch), *self.holds)}.values())
         others = list(self.others(data, *inputs))
-        constants = Constants(self.watch)
+        constants = Constants(self.watch, self.but)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the compiler's, on tensordict's and TorchRL's code
             if self.rung == TRACED:
@@ -181,7 +185,7 @@ class Compiled:
         if self.fixed:
             check_shapes(graph)
         if self.rung == REPLAYED:
-            return graph.forward
+            return torch.no_grad()(lambda inputs: graph.forward(*inputs))
         if self.most is not None and len(graph.graph.nodes) > self.most:
             raise RuntimeError(f"it is {len(graph.graph.nodes)} operations, too many to compile soon")
         return compile_record(graph, inputs)
@@ -193,7 +197,10 @@ class Compiled:
             words = f"cannot be {'compiled' if slow else 'recorded'} and runs without, several times slower"
         why = f" ({'; '.join(failed)})" if failed else ""
         advice = "; compile='on' stops here, compile='off' is silent" if slow else ""
-        getLogger("pgkit").log(WARNING if slow else INFO, "%s %s%s%s", self.name, words, why, advice)
+        as_asked = self.mode == "record" and self.rung == REPLAYED
+        getLogger("pgkit").log(
+            WARNING if slow else DEBUG if as_asked else INFO, "%s %s%s%s", self.name, words, why, advice
+        )
 
 
 compiled = Compiled  # reads as what it does: ``compiled(function, ...)``

@@ -17,7 +17,7 @@ from torch.overrides import TorchFunctionMode
 
 from pgkit.compiled.captured import captured
 from pgkit.compiled.decisions import Decisions
-from pgkit.compiled.native import record
+from pgkit.compiled.native import constants_of, record
 from pgkit.compiled.trial import check_repeats, undone
 
 Function = Callable[..., Sequence[Tensor]]
@@ -33,7 +33,7 @@ class Recorder:
         function: ``(data, *inputs) -> tensors``; changes tensors of ``held`` in place, and entries of ``data``.
         held: parameters, buffers, optimizer state and the like, each once.
         keys: the entries of the data, but for those that are held (a replay's priorities are both).
-        compile: ``(graph, inputs) -> code``.
+        compile: ``(graph, inputs) -> code``, a function of a list of tensors.
     """
 
     function: Function
@@ -43,7 +43,7 @@ class Recorder:
 
     def leaves(self, data: TensorDictBase | None) -> list[Tensor]:
         """The tensors of data."""
-        return [] if data is None else [data[key] for key in self.keys]
+        return [] if data is None else [data[key].detach() for key in self.keys]
 
     def graph(
         self, data: TensorDictBase | None, inputs: Sequence[Tensor]
@@ -74,8 +74,7 @@ class Recorder:
         code = self.compile(graph, [*fixed, *leaves, *inputs])
 
         def run(*tensors: Tensor) -> list[Tensor] | None:
-            with torch.no_grad():
-                results = code(*fixed, *tensors)
+            results = code([*fixed, *tensors])
             return results if not decisions else results[1:] if results[0] else None
 
         return run, decisions
@@ -149,9 +148,8 @@ def _by_decisions(
 def _check_constants(graph: GraphModule, held: Sequence[Tensor]) -> None:
     """A RuntimeError for a tensor that a graph uses without being given it, and that is a held one or written to."""
     memory = {tensor.untyped_storage().data_ptr() for tensor in held}
-    for node in graph.graph.find_nodes(op="get_attr"):
-        constant = getattr(graph, str(node.target))
-        if isinstance(constant, Tensor) and constant.untyped_storage().data_ptr() in memory:
+    for node, constant in constants_of(graph):
+        if constant.untyped_storage().data_ptr() in memory:
             raise RuntimeError(f"'{node.target}' shares memory with a parameter or buffer without being it")
         if _is_written(node):
             raise RuntimeError(f"it writes to '{node.target}', which is none of what it holds")

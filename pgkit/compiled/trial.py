@@ -25,6 +25,17 @@ def undone(tensors: Iterable[Tensor], function: Callable[[], Any]) -> Any:
                 tensor.copy_(value)
 
 
+def written_by(tensors: Sequence[Tensor], function: Callable[[], Any]) -> list[Tensor]:
+    """Those of the tensors that the function writes to; it runs for that, which is undone."""
+    versions = [x._version for x in tensors]
+
+    def written() -> list[Tensor]:
+        function()
+        return [x for x, version in zip(tensors, versions, strict=True) if x._version != version]
+
+    return undone(tensors, written)
+
+
 def check_repeats(
     native: Callable[..., Sequence[Tensor] | None],
     function: Callable[..., Sequence[Tensor]],

@@ -49,9 +49,8 @@ class Prioritized:
     def extend(self, new: Tensor, gone: Tensor, td_error: Tensor | None = None) -> None:
         """Takes the rows ``gone`` out; the rows ``new`` get the priorities of their errors, or the largest one."""
         self.tree.set(gone, 0.0)
-        if td_error is None:
-            self.tree.set(new, self.largest)
-        elif len(new):
+        self.tree.set(new, self.largest)
+        if td_error is not None and len(new):
             self.write_back(new.to(td_error.device), td_error)
 
     def sample(self, batches: int, batch_size: int, generator: torch.Generator) -> Tensor:
@@ -60,8 +59,12 @@ class Prioritized:
         return self.tree.find(share.to(self.tree.sums.device)).view(batches, batch_size)
 
     def write_back(self, index: Tensor, td_error: Tensor) -> None:
-        """Makes the errors ``[B]`` the priorities of the rows ``index [B]``; compiles into the update."""
+        """Makes the errors ``[B]`` the priorities of the rows ``index [B]``; compiles into the update.
+
+        A row whose error is not finite keeps its priority.
+        """
         priority = (td_error.abs().double() + self.eps) ** self.alpha
+        priority = torch.where(priority.isfinite(), priority, self.tree.values[index])
         self.largest.copy_(torch.maximum(self.largest, priority.max()))
         self.tree.set(index, priority)
 

@@ -173,6 +173,7 @@ class ReplayBuffer:
         Raises:
             UserError: fewer frames are stored than a batch has.
         """
+        check_whole_number(1, batch_size=batch_size, batches=batches)
         if batch_size > len(self):
             raise UserError(
                 f"batch_size={batch_size} is above the {len(self)} frames stored: collect more frames first"

@@ -25,7 +25,7 @@ def fail(where: str, error: BaseException) -> NoReturn:
     raise EnvironmentFailed(f"{where}: {what}", frames) from error
 
 
-def in_episode(env: Any, index: int, step: int, seed: int) -> str:
+def in_episode(env: Any, index: int, step: int, seed: int | None) -> str:
     """Where one environment failed: step 0 is the reset."""
     when = f"step {step:,} of the episode of reset(seed={seed})" if step else f"reset(seed={seed})"
     return f"environment {index} ({type(env).__name__}), {when}"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal, NoReturn
 
 import gymnasium as gym
@@ -12,14 +12,12 @@ from torch import Tensor
 from torchrl.data import Composite
 
 from pgkit.envs import spaces
-from pgkit.envs.checks import FLAGS, NUMBERS, check_step, checked_reset, misshapen
+from pgkit.envs.checks import FLAGS, NUMBERS, WRONG, check_step, checked_reset, checked_space, misshapen
 from pgkit.envs.failures import FAILURES, LONGEST, fail, in_episode, warn_of_length
 from pgkit.envs.numpy_entries import Info, Infos, Observations, Totals, flags, rewards
 from pgkit.envs.seeding import episode_seed
 from pgkit.errors import UserError
 from pgkit.seams import Entries, Step
-
-WRONG = (ValueError, TypeError, KeyError)  # what writing an observation raises that is not of its space
 
 
 class Gymnasium:
@@ -28,7 +26,8 @@ class Gymnasium:
     An episode that ends is reset within the same step. Every episode is seeded from ``(seed, index of the environment,
     number of the episode)``, so the state of a deterministic simulator is those numbers and the actions since: that
     is what :meth:`state_dict` stores and :meth:`load_state_dict` replays, bit for bit. Of an episode beyond 100,000
-    steps the actions are dropped: there, a resume begins the next episode.
+    steps the actions are dropped: there, a resume begins the next episode. With ``reseed=False`` an environment is
+    seeded once, and a resume begins new episodes.
 
     Args:
         envs: the environments.
@@ -37,10 +36,11 @@ class Gymnasium:
         flatten: False keeps the entries of a Dict observation apart.
         info: entries of ``info`` that a step gives.
         clip_rewards: a step's reward is clipped to [-1, 1]; the episode's counts as it is.
+        reseed: seed every episode; False: the first one of each environment only.
+        options: given to every reset.
     """
 
     device = torch.device("cpu")
-    resume: Literal["exact", "new episodes"] = "exact"
     masks = False
 
     def __init__(
@@ -51,15 +51,20 @@ class Gymnasium:
         flatten: bool = True,
         info: Info = (),
         clip_rewards: bool = False,
+        reseed: bool = True,
+        options: Mapping[str, Any] | None = None,
     ) -> None:
         if len({id(env.unwrapped) for env in envs}) < len(envs):
             raise UserError("the function that makes an environment gave the same one twice: it must make a new one")
         self.envs, self.num_envs, self.first, self.clip_rewards = envs, len(envs), first, clip_rewards
-        entries = spaces.observation_entries(envs[0].observation_space, flatten)
-        self.to_env = spaces.to_env(envs[0].action_space)
+        self.reseed, self.options = reseed, None if options is None else dict(options)
+        self.resume: Literal["exact", "new episodes"] = "exact" if reseed else "new episodes"
+        observed, acted = (checked_space(envs[0], name) for name in ("observation_space", "action_space"))
+        entries = spaces.observation_entries(observed, flatten)
+        self.to_env = spaces.to_env(acted)
         n = self.num_envs
         self.observation_spec = Composite({entry.key: entry.spec(n) for entry in entries}, shape=(n,))
-        self.action_spec = Composite(action=spaces.action_spec(envs[0].action_space, n), shape=(n,))
+        self.action_spec = Composite(action=spaces.action_spec(acted, n), shape=(n,))
         self.reward_spec, self.done_spec = rewards(n), flags(n)
         self._fresh, self._next, self._infos = Observations(entries, n), Observations(entries, n), Infos(info, n)
         self.info_spec, self._totals = self._infos.spec, Totals(n)
@@ -75,6 +80,7 @@ class Gymnasium:
         self.seed = seed
         self._totals.forget(np.ones(self.num_envs, bool))
         self._begun = np.zeros(self.num_envs, bool)  # the episode was begun and has not been stepped since
+        self._seeded = np.zeros(self.num_envs, bool)
         self._episode = np.full(self.num_envs, -1)
         self._taken: list[np.ndarray] = []  # actions [N, ...] of the last steps
         self._since = np.zeros(self.num_envs, np.int64)  # where in those each episode begins
@@ -91,14 +97,14 @@ class Gymnasium:
 
     def _begin(self, i: int) -> None:
         self._episode[i] += 1
-        seed = episode_seed(self.seed, self.first + i, int(self._episode[i]))
-        first_ones = self._episode[i] < 2  # whose resets are looked at closely
+        seeds = self.reseed or not self._seeded[i]
+        seed = episode_seed(self.seed, self.first + i, int(self._episode[i])) if seeds else None
         try:
-            result = checked_reset(self.envs[i], seed) if first_ones else self.envs[i].reset(seed=seed)
+            obs = checked_reset(self.envs[i], seed, self.options)
         except FAILURES as error:
             fail(in_episode(self.envs[i].unwrapped, self.first + i, 0, seed), error)
-        self._write(i, result[0], "reset")
-        self._begun[i], self._endless[i] = True, False
+        self._write(i, obs, "reset")
+        self._begun[i], self._seeded[i], self._endless[i] = True, True, False
         self._since[i] = len(self._taken)
         if 2 * int(self._since.min()) > len(self._taken):  # more than half belongs to episodes that are over
             self._forget()
@@ -145,7 +151,7 @@ class Gymnasium:
                 result = env.step(given[i])
             except FAILURES as error:
                 self._fail(i, error)
-            if looks or len(result) != 5:
+            if looks or type(result) is not tuple or len(result) != 5:
                 check_step(env, actions[i], result)
             obs, gained, ended, cut, info = result
             if type(gained) not in NUMBERS or type(ended) not in FLAGS or type(cut) not in FLAGS:
@@ -157,7 +163,8 @@ class Gymnasium:
                 raise misshapen(env, "step", error) from error
             if infos is not None:
                 infos.write(i, info)
-        self._taken.append(actions)
+        if self.reseed:
+            self._taken.append(actions)
         if len(self._taken) > LONGEST:
             self._give_up()
         self._stepped = True
@@ -183,22 +190,29 @@ class Gymnasium:
         return {"seed": self.seed, "rows": rows}
 
     def load_state_dict(self, state: dict[str, Any]) -> Entries:
-        """Restores every environment by replaying the actions of its current episode."""
+        """Restores every environment by replaying the actions of its current episode, or begins new ones."""
         if "rows" not in state:  # they are lost: episodes with a number that none has had
             self._restart(self.seed)
             self._episode[:] = state["steps"]
             return self.reset()
         self._restart(state["seed"])
+        if not self.reseed:
+            self._episode[:] = [row["episode"] for row in state["rows"]]
+            return self.reset()
         history = [row["actions"] for row in state["rows"]]
         for i, (env, row) in enumerate(zip(self.envs, state["rows"], strict=True)):
             self._episode[i] = max(row["episode"], 0) - 1
             self._begin(i)
+            self._totals.step_count[i] = 0
             for action in row["actions"]:
-                obs, reward, *_ = env.step(action.copy())
+                try:
+                    obs, reward, *_ = env.step(action.copy())
+                except FAILURES as error:
+                    self._fail(i, error)
                 self._write(i, obs, "step")
                 self._totals.episode_reward[i] += np.float32(reward)
+                self._totals.step_count[i] += 1
                 self._begun[i] = False
-            self._totals.step_count[i] = len(row["actions"])
         longest = max(history, key=len)
         taken = np.zeros((len(longest), self.num_envs, *longest.shape[1:]), longest.dtype)
         self._since = np.array([len(longest) - len(actions) for actions in history])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, Literal
 
 import numpy as np
@@ -11,6 +12,7 @@ from torch import Tensor
 from torchrl.data import Composite
 
 from pgkit.envs import spaces
+from pgkit.envs.checks import WRONG, misshapen
 from pgkit.envs.failures import FAILURES, fail, in_vector
 from pgkit.envs.numpy_entries import Info, Infos, Observations, Totals, flags, rewards
 from pgkit.envs.seeding import episode_seed
@@ -29,14 +31,23 @@ class GymnasiumVector:
         env: the vector.
         seed: the run's seed; environment ``i`` is seeded with ``seed + i``, once.
         first: index of the first environment, where this is a share of a larger vector.
-        flatten, info: as for :class:`~pgkit.envs.Gymnasium`.
+        flatten, info, options: as for :class:`~pgkit.envs.Gymnasium`.
     """
 
     device = torch.device("cpu")
     resume: Literal["exact", "new episodes"] = "new episodes"
 
-    def __init__(self, env: VectorEnv, seed: int = 0, first: int = 0, flatten: bool = True, info: Info = ()) -> None:
+    def __init__(
+        self,
+        env: VectorEnv,
+        seed: int = 0,
+        first: int = 0,
+        flatten: bool = True,
+        info: Info = (),
+        options: Mapping[str, Any] | None = None,
+    ) -> None:
         self.env, self.num_envs, self.seed, self.first = env, env.num_envs, seed, first
+        self.options = None if options is None else dict(options)
         self.mode = AutoresetMode(env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP))
         self.masks = self.mode is AutoresetMode.NEXT_STEP
         entries = spaces.observation_entries(env.single_observation_space, flatten)
@@ -59,19 +70,20 @@ class GymnasiumVector:
         if seed is not None or not self._begun:
             first_time = seed is not None or not self._steps
             self.seed, self._steps = (self.seed, self._steps) if seed is None else (seed, 0)
+            seed = self.seed % (2**31 - self.num_envs)  # Gymnasium adds the environment's number; 31 bits
             try:
-                obs, _ = self.env.reset(seed=self.seed if first_time else None)
+                obs, _ = self.env.reset(seed=seed if first_time else None, options=self.options)
             except FAILURES as error:
-                fail(in_vector(self.env, self.first, self.num_envs, 0, self.seed), error)
-            self._fresh.write_all(obs, self.env.observation_space)
+                fail(in_vector(self.env, self.first, self.num_envs, 0, seed), error)
+            self._write(self._fresh, obs, "reset")
             self._totals.forget(np.ones(self.num_envs, bool))
             self._ended[:], self._begun = False, True
         return self._fresh.tensors
 
     def _reset_rows(self, rows: np.ndarray) -> Entries:
         if rows.any():
-            obs, _ = self.env.reset(options={"reset_mask": rows.copy()})
-            self._fresh.write_all(obs, self.env.observation_space)
+            obs, _ = self.env.reset(options={**(self.options or {}), "reset_mask": rows.copy()})
+            self._write(self._fresh, obs, "reset")
             self._totals.forget(rows)
             self._ended &= ~rows
         return self._fresh.tensors
@@ -85,13 +97,13 @@ class GymnasiumVector:
             obs, reward, terminated, truncated, info = self.env.step(actions)
         except FAILURES as error:
             fail(in_vector(self.env, self.first, self.num_envs, self._steps + 1, self.seed), error)
-        totals.reward[:], totals.terminated[:], totals.truncated[:] = reward, terminated, truncated
+        self._write_totals(reward, terminated, truncated)
         totals.count()
         if counts is not None:
             totals.forget(~counts)
         self._infos.clear()
         self._infos.write_all(info)
-        self._next.write_all(obs, self.env.observation_space)
+        self._write(self._next, obs, "step")
         self._fresh.copy_from(self._next)
         self._ended[:], self._begun = totals.terminated | totals.truncated, False
         self._steps += 1
@@ -107,6 +119,24 @@ class GymnasiumVector:
             None if counts is None else torch.from_numpy(counts),
         )  # fmt: skip
 
+    def _write(self, into: Observations, obs: Any, method: str) -> None:
+        try:
+            into.write_all(obs, self.env.observation_space)
+        except WRONG as error:
+            raise misshapen(self.env, method, error) from error
+
+    def _write_totals(self, reward: Any, terminated: Any, truncated: Any) -> None:
+        totals, flags = self._totals, {"terminations": terminated, "truncations": truncated}
+        for name, x in {"rewards": reward, **flags}.items():
+            found, kinds = np.asarray(x), "b" if name in flags else "fiub"
+            if found.shape != totals.reward.shape or found.dtype.kind not in kinds:
+                raise UserError(
+                    f"{type(self.env.unwrapped).__name__}.step returned {name} of shape {found.shape} and type "
+                    f"{found.dtype}: return {'a bool' if name in flags else 'a number'} for each of the "
+                    f"{self.num_envs} environments"
+                )
+        totals.reward[:], totals.terminated[:], totals.truncated[:] = reward, terminated, truncated
+
     def _write_finals(self, info: dict[str, Any]) -> None:
         """The true final observations and infos of episodes that were reset in the same step."""
         finals = info.get("final_obs", info.get("final_observation"))
@@ -117,7 +147,10 @@ class GymnasiumVector:
             )
         for row in np.flatnonzero(self._ended):
             one = {name: x[row] for name, x in finals.items()} if isinstance(finals, dict) else finals[row]
-            self._next.write(int(row), one)
+            try:
+                self._next.write(int(row), one)
+            except WRONG as error:
+                raise misshapen(self.env, "step", error) from error
         self._infos.write_all(info.get("final_info", {}), only=self._ended)
 
     def state_dict(self) -> dict[str, Any]:

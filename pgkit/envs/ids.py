@@ -6,14 +6,22 @@ import dataclasses
 import difflib
 import importlib
 import pkgutil
+import re
 import warnings
 from typing import Any
 
 import gymnasium as gym
+from gymnasium.envs.registration import EnvSpec
 
 from pgkit.envs.atari import make_atari
 from pgkit.envs.rendering import PACKAGES, choose_backend
 from pgkit.errors import UserError
+
+_PLUGINS = {  # ids that a package registers when it is imported
+    "MiniGrid-": "minigrid", "BabyAI-": "minigrid", "MiniWorld-": "miniworld", "highway-": "highway_env",
+    "Fetch": "gymnasium_robotics", "AntMaze": "gymnasium_robotics", "PointMaze": "gymnasium_robotics",
+    "Adroit": "gymnasium_robotics", "FrankaKitchen": "gymnasium_robotics", "Meta-World/": "metaworld",
+}  # fmt: skip
 
 
 def make_one(env_id: str, **kwargs: Any) -> Any:
@@ -43,9 +51,24 @@ def make_one(env_id: str, **kwargs: Any) -> Any:
     except gym.error.Error as error:
         raise UserError(f"environment '{env_id}': {str(error).splitlines()[0]}") from error
     except TypeError as error:
-        if not kwargs or "argument" not in str(error):
+        if not re.search(r"missing \d+ required|unexpected keyword argument", str(error)):
             raise
-        raise UserError(f"environment '{env_id}' cannot be made with these settings: {error}") from error
+        reason = str(error).partition(" was raised from")[0]
+        raise UserError(
+            f"environment '{env_id}' cannot be made with these settings: {reason}; --env.KEYWORD VALUE (envs.make(..., "
+            "keyword=value)) gives one"
+        ) from error
+
+
+def changed(spec: EnvSpec) -> dict[str, Any]:
+    """The keywords with which ``gymnasium.make(spec.id, ...)`` gives what ``spec`` says."""
+    known = gym.registry.get(spec.id)
+    if known is None or spec.additional_wrappers or spec.entry_point != known.entry_point:
+        raise UserError(
+            f"the EnvSpec of '{spec.id}' is not the registered one: give envs.make a function, lambda: spec.make()"
+        )
+    limit = {} if spec.max_episode_steps == known.max_episode_steps else {"max_episode_steps": spec.max_episode_steps}
+    return {**limit, **spec.kwargs}
 
 
 def _make_mpe2(env_id: str, max_episode_steps: int | None = None, **kwargs: Any) -> Any:
@@ -77,7 +100,9 @@ def _not_installed(env_id: str, error: Exception) -> UserError:
     if colon and getattr(cause, "name", None) not in (None, module):
         return UserError(f"environment '{env_id}': importing '{module}' failed ({cause})")
     if colon:
-        return UserError(f"environment '{env_id}': no module '{module}' to import, neither here nor installed")
+        return UserError(
+            f"environment '{env_id}': no module '{module}' to import, neither here nor installed (pip install {module})"
+        )
     if newest := _successor(env_id):
         return UserError(f"environment '{env_id}' is one of Gymnasium's former ones: use {newest}")
     reason = str(error).splitlines()[0].rstrip(".")
@@ -133,7 +158,10 @@ def _make_dm_control(env_id: str, **kwargs: Any) -> gym.Env:
 def _unknown(env_id: str, known: list[str]) -> UserError:
     nearest = difflib.get_close_matches(env_id, known, n=3, cutoff=0.4)
     hint = f"; the nearest names are {', '.join(nearest)}" if nearest else "; see gymnasium.pprint_registry()"
-    return UserError(f"unknown environment id '{env_id}'{hint}; where a package registers it: PACKAGE:{env_id}")
+    package, _, name = env_id.rpartition(":")
+    package = package or next((x for start, x in _PLUGINS.items() if env_id.startswith(start)), "PACKAGE")
+    registers = f"{package}:{name:.100}"
+    return UserError(f"unknown environment id '{env_id:.100}'{hint}; where a package registers it: {registers}")
 
 
 def _extra(env_id: str) -> str:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import inspect
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
-from logging import getLogger
 from typing import Any, NamedTuple, cast
 
 import gymnasium as gym
 import torch
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import VectorEnv as GymVectorEnv
 from torchrl.envs import EnvBase
 
@@ -19,12 +19,13 @@ from pgkit.envs.action_repeat import ActionRepeat
 from pgkit.envs.agents import Names
 from pgkit.envs.gym_list import Gymnasium
 from pgkit.envs.gym_vector import GymnasiumVector
-from pgkit.envs.ids import is_atari, make_one, rendered
+from pgkit.envs.ids import changed, is_atari, make_one, rendered
 from pgkit.envs.limits import limited
 from pgkit.envs.numpy_entries import Info
 from pgkit.envs.parallel import Parallel, is_parallel, refuse_turns
 from pgkit.envs.pixels import FrameStack, Pixels
 from pgkit.envs.seeding import episode_seed
+from pgkit.envs.statistics import warn_of_statistics
 from pgkit.envs.torch_batch import Torch
 from pgkit.envs.vector import VectorEnv
 from pgkit.envs.vmas_batch import Vmas
@@ -47,10 +48,12 @@ class Settings(NamedTuple):
     groups: Names | None = None
     compile: str = "off"
     env_timeout: float | None = None
+    reseed: bool = True
+    reset_options: Mapping[str, Any] | None = None
 
 
 def make(
-    env_id: str | EnvBase | GymVectorEnv | Callable[..., Any],
+    env_id: str | EnvSpec | EnvBase | GymVectorEnv | Callable[..., Any],
     num_envs: int | None = None,
     *,
     seed: int = 0,
@@ -68,12 +71,14 @@ def make(
     compile: str = "off",
     env_timeout: float | None = None,
     restart_workers: bool = False,
+    reseed: bool = True,
+    reset_options: Mapping[str, Any] | None = None,
     **kwargs: Any,
 ) -> VectorEnv:
     """Makes a vector of environments.
 
     Args:
-        env_id: a Gymnasium id, ``dm_control/<domain>-<task>-v0`` (also ``dmc:<domain>-<task>``),
+        env_id: a Gymnasium id or ``EnvSpec``, ``dm_control/<domain>-<task>-v0`` (also ``dmc:<domain>-<task>``),
             ``vmas/<scenario>``, ``mpe2/<name>``; a vector of Gymnasium's (``gymnasium.make_vec(...)``); a TorchRL
             ``EnvBase`` with one batch dimension or none; or a function or class. What that returns decides what it is:
             one ``gym.Env``, ``dm_env`` or PettingZoo ``ParallelEnv``, a new one at every call, or one of the former. It
@@ -87,18 +92,21 @@ def make(
             own name and in its own type: for one encoder per entry (:func:`pgkit.modules.dict_encoder`) and for
             action masks.
         info: entries of ``info`` that reach the rollout under ``("next", name)``: names of single numbers, or a
-            mapping from names to TorchRL specs of one environment's.
+            mapping from names to TorchRL specs of one environment's; ``episode`` is what
+            ``RecordEpisodeStatistics`` writes. A run logs their means at the ends of episodes.
         max_episode_steps: time limit; None: the id's own (VMAS's: 100), which a function or class has none of.
         groups: of many agents, their names by the name of their group; None: one group, or by the beginnings of their
             names where their spaces differ.
+        reseed: every episode has a seed of its own, so that a resume can replay it. False seeds each environment once,
+            for one that counts on a single stream of random numbers (a curriculum); a resume then begins new episodes.
+        reset_options: given to every reset as Gymnasium's ``options``.
         compile: ``auto`` records the step of a batched torch simulator (VMAS's, or a function that makes a TorchRL
             ``EnvBase``) and compiles it: about ten times as fast, after up to a minute the first time. What cannot be
             recorded runs as it is, with a line in the log; other environments have nothing to record. ``on``: then it
             is a ``UserError``.
         env_timeout: seconds that one step of a process's environments may take; None: any time.
         restart_workers: a worker process that has ended or hangs is replaced. Its environments go on where they were,
-            those that cannot (:attr:`~pgkit.seams.Simulator.resume`) begin new episodes. It costs the state of every
-            environment with every rollout.
+            those that cannot (:attr:`~pgkit.seams.Simulator.resume`) begin new episodes.
         **kwargs: passed to ``gymnasium.make``, to the dm_control task, or to the function or class.
 
     Raises:
@@ -119,7 +127,8 @@ def make(
             what = f"workers={workers}" if workers > 1 else f"{next(iter(kwargs))}=..."
             raise UserError(f"{what} with an environment that is made already: give a function that makes one")
         images = (pixels, stack, fast_render, clips)
-        given = Settings(device, action_repeat, flatten, info, max_episode_steps, *images, groups, compile, env_timeout)
+        rest = (max_episode_steps, *images, groups, compile, env_timeout, reseed, reset_options)
+        given = Settings(device, action_repeat, flatten, info, *rest)
         return _adopt(env_id, num_envs, seed, given)
     num_envs = 1 if num_envs is None else num_envs
     if num_envs < 1 or workers < 1 or workers > num_envs:
@@ -127,6 +136,8 @@ def make(
             f"num_envs={num_envs}, workers={workers}: every worker needs at least one environment; "
             "choose 1 <= workers <= num_envs"
         )
+    if isinstance(env_id, EnvSpec):
+        env_id, kwargs = env_id.id, {**changed(env_id), **kwargs}
     limited = isinstance(env_id, str) and not env_id.startswith(("dm_control/", "dmc:"))  # by Gymnasium
     if limited and max_episode_steps is not None:
         kwargs["max_episode_steps"] = max_episode_steps
@@ -136,7 +147,8 @@ def make(
         kwargs = rendered(env_id, pixels) | kwargs
     images = (None if atari else pixels, stack, fast_render, clips)
     steps = None if limited else max_episode_steps
-    settings = Settings(device, action_repeat, flatten, info, steps, *images, groups, compile, env_timeout)
+    rest = (steps, *images, groups, compile, env_timeout, reseed, reset_options)
+    settings = Settings(device, action_repeat, flatten, info, *rest)
     function = _function(env_id, kwargs)
     env = VectorEnv(partial(_limited, function, settings), num_envs, seed, workers)
     env.env_timeout, env.restart_workers = env_timeout, restart_workers
@@ -183,8 +195,8 @@ def _function(env_id: Any, kwargs: dict[str, Any]) -> Callable[..., Any]:
         return partial(make_one, env_id, **kwargs)
     if not callable(env_id) or isinstance(env_id, gym.Env):
         raise UserError(
-            f"envs.make takes an id, a function or class that makes an environment, a gymnasium.vector.VectorEnv or a "
-            f"TorchRL EnvBase, this is a {type(env_id).__name__}: envs.make(lambda: ...)"
+            "envs.make takes an id, a function or class that makes an environment, an EnvSpec, a gymnasium.vector."
+            f"VectorEnv or a TorchRL EnvBase, this is a {type(env_id).__name__}: envs.make(lambda: ...)"
         )
     return partial(env_id, **kwargs)
 
@@ -196,7 +208,7 @@ def _limited(function: Callable[..., Any], settings: Settings, first: int, count
 
 def _share(function: Callable[..., Any], settings: Settings, first: int, count: int, seed: int) -> Simulator:
     """The environments ``first`` to ``first + count``: what the function makes decides how."""
-    own_seed = seed if first == 0 else episode_seed(seed, first, 0)
+    own_seed = seed % 2**31 if first == 0 else episode_seed(seed, first, 0)
     given = {"num_envs": count, "seed": own_seed, "device": settings.device, "groups": settings.groups}
     given |= {"compile": None if settings.compile == "off" else settings.compile}
     names = _named(function) - {name for name, value in given.items() if value is None}
@@ -222,12 +234,12 @@ def _share(function: Callable[..., Any], settings: Settings, first: int, count: 
         rest.append(function(**{name: given[name] for name in names & given.keys()}))
     if is_parallel(made):
         _only_for_single(settings, made)
-        return Parallel([made, *rest], seed, first, settings.groups)
+        return Parallel([made, *rest], seed, first, settings.groups, settings.reseed, settings.reset_options)
     if settings.groups is not None:
         raise UserError(f"groups= is for environments with many agents, {type(made).__name__} has one: leave it out")
-    _warn_of_statistics(made)
-    envs = [_one(env, settings) for env in (made, *rest)]
-    return Gymnasium(envs, seed, first, settings.flatten, settings.info, settings.reward_clipping)
+    warn_of_statistics(made)
+    envs, resets = [_one(env, settings) for env in (made, *rest)], (settings.reseed, settings.reset_options)
+    return Gymnasium(envs, seed, first, settings.flatten, settings.info, settings.reward_clipping, *resets)
 
 
 def _named(function: Any) -> set[str]:
@@ -261,29 +273,22 @@ def _simulator(env: EnvBase | GymVectorEnv, seed: int, first: int, settings: Set
         "pixels": settings.pixels is not None,
         "frame_stack": settings.frame_stack > 1,
         "reward_clipping": settings.reward_clipping,
+        "reset_options": settings.reset_options is not None and isinstance(env, EnvBase),
     }
     if what := [name for name, given in single.items() if given]:
         raise UserError(
             f"{what[0]}= is for single Gymnasium environments, this is a {type(env).__name__}: use one of its "
             "library's wrappers (TorchRL: StepCounter(max_steps=...), FrameSkipTransform(...))"
         )
+    if not settings.reseed:
+        raise UserError(f"reseed=False: {type(env).__name__} is seeded once anyway: leave it out")
+    warn_of_statistics(env)
     if isinstance(env, GymVectorEnv):
         if settings.compile == "on":
             raise UserError(f"compile='on' records torch simulators, a {type(env).__name__} is none: 'auto' or 'off'")
-        return GymnasiumVector(env, seed, first, settings.flatten, settings.info)
+        return GymnasiumVector(env, seed, first, settings.flatten, settings.info, settings.reset_options)
     env = env if settings.device is None else env.to(settings.device)
     return Torch(env, seed, first, settings.info, cast(Mode, settings.compile))
-
-
-def _warn_of_statistics(env: Any) -> None:
-    """Says that a wrapper's statistics are its own: a resume and an evaluation begin with none."""
-    while isinstance(env, gym.Wrapper):
-        if isinstance(env, gym.wrappers.NormalizeObservation | gym.wrappers.NormalizeReward):
-            getLogger("pgkit").warning(
-                "%s keeps statistics that evaluation and a resume begin anew: use --normalize-obs "
-                "(modules.ObsNormalizer) and --scale-returns, which are part of the checkpoint", type(env).__name__,
-            )  # fmt: skip
-        env = env.env
 
 
 def _one(env: Any, settings: Settings) -> gym.Env:

@@ -12,7 +12,9 @@ from gymnasium.vector.utils import iterate
 from torch import Tensor
 from torchrl.data import Categorical, Composite, TensorSpec, Unbounded
 
-from pgkit.envs.spaces import Entry, itself
+from pgkit.envs.parts import numbers
+from pgkit.envs.spaces import TAKEN, Entry, itself
+from pgkit.errors import UserError
 from pgkit.seams import Entries, Key
 
 Info: TypeAlias = Sequence[Key] | Mapping[Key, TensorSpec]
@@ -28,21 +30,18 @@ class Observations:
         self._columns = [(entry.read, x, entry.shape) for entry, x in zip(entries, self.arrays, strict=True)]
 
     def write(self, row: int, obs: Any) -> None:
-        """Writes what one environment returned; ``ValueError`` where it is not of its space's shape."""
+        """Writes what one environment returned; ``ValueError`` where it is not of its space."""
         for read, array, shape in self._columns:
-            x = obs if read is itself else read(obs)
-            if (x.shape if type(x) is np.ndarray else np.shape(x)) != shape:
-                raise ValueError(f"shape {np.shape(x)}, its space says {shape}")
-            array[row] = x
+            array[row] = numbers(obs if read is itself else read(obs), shape)
 
     def write_all(self, obs: Any, space: gym.Space) -> None:
         """Writes a batch of observations of a batched ``space``."""
         for entry, array in zip(self.entries, self.arrays, strict=True):
             if entry.read_all is not None:
-                array[...] = entry.read_all(obs)
+                array[...] = numbers(entry.read_all(obs), array.shape)
             else:
                 for row, one in enumerate(iterate(space, obs)):
-                    array[row] = entry.read(one)
+                    array[row] = numbers(entry.read(one), entry.shape)
 
     def copy_from(self, other: Observations) -> None:
         """Takes over every entry of ``other``."""
@@ -59,7 +58,12 @@ class Infos:
     """
 
     def __init__(self, wanted: Info, num_envs: int) -> None:
+        wanted = [wanted] if isinstance(wanted, str) else wanted
+        if not isinstance(wanted, Sequence | Mapping) or not all(isinstance(key, str | tuple) for key in wanted):
+            raise UserError(f"info={wanted!r:.60}: give names of entries, info=('is_success',)")
         specs = dict(wanted) if isinstance(wanted, Mapping) else dict.fromkeys(wanted, None)
+        if taken := [key for key in specs if as_path(key)[0] in TAKEN]:
+            raise UserError(f"info={taken[0]!r}: rollouts have an entry of that name: rename it in a wrapper")
         if "episode" in specs:
             del specs["episode"]
             specs |= {("episode", "r"): None, ("episode", "l"): None}
@@ -79,7 +83,7 @@ class Infos:
         for path, array in self._arrays:
             value = _found(info, path)
             if value is not None:
-                array[row] = value
+                array[row] = _as_info(path, value, array.shape[1:])
 
     def write_all(self, info: Any, only: np.ndarray | None = None) -> None:
         """Writes the entries of a vector's ``info``, where it has them (Gymnasium's ``_name`` says where)."""
@@ -89,7 +93,18 @@ class Infos:
                 rows = np.ones(len(array), bool) if where is None else np.asarray(where, bool)
                 rows = rows if only is None else rows & only
                 values = np.asarray(value)[rows]
-                array[rows] = np.reshape(values.astype(array.dtype), (len(values), *array.shape[1:]))
+                array[rows] = _as_info(path, values, (len(values), *array.shape[1:]))
+
+
+def _as_info(path: tuple[str, ...], value: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """An entry of ``info`` as an array of this shape; one number may lack the 1 at the end."""
+    x = np.asarray(value)
+    if x.shape not in (shape, shape[:-1]) or x.dtype.kind not in "fiub":
+        raise UserError(
+            f"info={'.'.join(path)!r} is {value!r:.60}: name entries that are single numbers, or give their TorchRL "
+            "specs, info={name: Unbounded(shape)}"
+        )
+    return x.reshape(shape)
 
 
 def as_path(key: Key) -> tuple[str, ...]:

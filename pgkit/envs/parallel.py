@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import gymnasium as gym
@@ -11,11 +11,13 @@ import torch
 from torch import Tensor
 from torchrl.data import Categorical, Composite
 
-from pgkit.envs.agents import Group, Names, groups_of, rewards, under
+from pgkit.envs.agents import Names, groups_of, rewards, under
+from pgkit.envs.checks import WRONG, misshapen
 from pgkit.envs.failures import FAILURES, LONGEST, fail, in_episode, warn_of_length
 from pgkit.envs.numpy_entries import flags
 from pgkit.envs.seeding import episode_seed
-from pgkit.envs.spaces import ToEnv, to_env
+from pgkit.envs.spaces import to_env
+from pgkit.envs.teams import Team
 from pgkit.errors import UserError
 from pgkit.seams import Entries, Key, Step
 
@@ -49,16 +51,26 @@ class Parallel:
         seed: the run's seed.
         first: index of the first one, where this is a share of a larger vector.
         groups: names of agents by the name of their group; None: one, or by their names where their spaces differ.
+        reseed, options: as for :class:`~pgkit.envs.Gymnasium`.
     """
 
     device = torch.device("cpu")
-    resume: Literal["exact", "new episodes"] = "exact"
     masks = False
 
-    def __init__(self, envs: Sequence[ParallelEnv], seed: int = 0, first: int = 0, groups: Names | None = None) -> None:
+    def __init__(
+        self,
+        envs: Sequence[ParallelEnv],
+        seed: int = 0,
+        first: int = 0,
+        groups: Names | None = None,
+        reseed: bool = True,
+        options: Mapping[str, Any] | None = None,
+    ) -> None:
         if len({id(env) for env in envs}) < len(envs):
             raise UserError("the function that makes an environment gave the same one twice: it must make a new one")
         self.envs: Sequence[Any] = envs
+        self.reseed, self.options = reseed, None if options is None else dict(options)
+        self.resume: Literal["exact", "new episodes"] = "exact" if reseed else "new episodes"
         self.num_envs, self.first, one, n = len(envs), first, envs[0], len(envs)
         spaces = ({a: space(a) for a in one.possible_agents} for space in (one.observation_space, one.action_space))
         self.groups = groups_of(type(one).__name__, *spaces, groups)
@@ -75,7 +87,7 @@ class Parallel:
         self.done_spec = flags(n)
         self.done_spec.update(under(self.groups, n, ends))
         self.to_env = to_env(self.groups[0].action)
-        self._teams = [_Team(g, n) for g in self.groups]
+        self._teams = [Team(g, n) for g in self.groups]
         self._terminated, self._truncated = np.zeros((n, 1), bool), np.zeros((n, 1), bool)
         self._steps, self._result = np.zeros(n, np.int64), self._as_step()
         self.step_count = torch.from_numpy(self._steps)
@@ -99,6 +111,7 @@ class Parallel:
     def _restart(self, seed: int) -> None:
         self.seed = seed
         self._begun = np.zeros(self.num_envs, bool)  # the episode was begun and has not been stepped since
+        self._seeded = np.zeros(self.num_envs, bool)
         self._episode = np.full(self.num_envs, -1)
         self._taken: list[list[list[np.ndarray]]] = [[] for _ in self.envs]  # actions of the running episodes
         self._endless = np.zeros(self.num_envs, bool)  # whose episode is too long to be replayed
@@ -114,17 +127,20 @@ class Parallel:
 
     def _begin(self, i: int) -> None:
         self._episode[i] += 1
-        seed = episode_seed(self.seed, self.first + i, int(self._episode[i]))
+        given: dict[str, Any] = {} if self.options is None else {"options": dict(self.options)}
+        if self.reseed or not self._seeded[i]:
+            given["seed"] = episode_seed(self.seed, self.first + i, int(self._episode[i]))
+            self._seeded[i] = True
         try:
-            result = self.envs[i].reset(seed=seed)
+            result = self.envs[i].reset(**given)
         except FAILURES as error:
-            fail(in_episode(self.envs[i], self.first + i, 0, seed), error)
-        if not isinstance(result, tuple) or len(result) != 2:
+            fail(in_episode(self.envs[i], self.first + i, 0, given.get("seed")), error)
+        if not isinstance(result, tuple) or len(result) != 2 or not isinstance(result[0], dict):
             raise UserError(
-                f"{type(self.envs[i]).__name__}.reset returned a {type(result).__name__}: return (observations, infos)"
+                f"{type(self.envs[i]).__name__}.reset returned a {type(result).__name__}: return (observations, "
+                "infos), dicts by the agents' names"
             )
-        for team in self._teams:
-            team.observe(team.fresh, i, result[0], self.envs[i].agents)
+        self._observe("reset", i, result[0], self.envs[i].agents)
         self._begun[i], self._taken[i], self._endless[i] = True, [], False
 
     def step(self, action: Entries) -> Step:
@@ -138,7 +154,8 @@ class Parallel:
         for i in range(self.num_envs):
             given = [x[i] for x in actions]
             self._one_step(i, given)
-            self._keep(i, given)
+            if self.reseed:
+                self._keep(i, given)
         for team in self._teams:
             team.fresh.copy_from(team.next)
         for i in np.flatnonzero(self._terminated | self._truncated):
@@ -173,14 +190,32 @@ class Parallel:
                 "truncations, infos), dicts by the agents' names"
             )
         observations, reward, terminated, truncated, _ = result
+        self._check(env, acting, result)
         over = not env.agents or all(terminated.get(x) or truncated.get(x) for x in env.agents)
         cut = over and any(truncated.get(x) and not terminated.get(x) for x in acting)
         self._truncated[i], self._terminated[i] = cut, over and not cut
         present = [x for x in env.agents if not (terminated.get(x) or truncated.get(x))]
+        self._observe("step", i, observations, present)
         for team in self._teams:
-            team.observe(team.next, i, observations, present)
-            team.write(i, acting, reward, terminated, truncated)
+            team.write(env, i, acting, reward, terminated, truncated)
         self._steps[i] += 1
+
+    def _observe(self, method: str, i: int, observations: dict[str, Any], present: Sequence[str]) -> None:
+        for team in self._teams:
+            try:
+                team.observe(team.next if method == "step" else team.fresh, i, observations, present)
+            except WRONG as error:
+                raise misshapen(self.envs[i], method, error) from error
+
+    def _check(self, env: Any, acting: set[str], result: tuple[Any, ...]) -> None:
+        """A ``UserError`` for what is no dict of the agents that acted."""
+        for what, x in zip(("observations", "rewards", "terminations", "truncations"), result, strict=False):
+            missing = acting - x.keys() if isinstance(x, dict) else acting
+            if missing:
+                raise UserError(
+                    f"{type(env).__name__}.step returned no {what} of agent '{min(missing)}', which acted: return a "
+                    "dict with all agents that acted"
+                )
 
     def state_dict(self) -> dict[str, Any]:
         """Of every environment the number of its episode and the actions since that began, by group."""
@@ -197,6 +232,9 @@ class Parallel:
             self._episode[:] = state["steps"]
             return self.reset()
         self._restart(state["seed"])
+        if not self.reseed:
+            self._episode[:] = [row["episode"] for row in state["rows"]]
+            return self.reset()
         for i, row in enumerate(state["rows"]):
             self._episode[i] = max(row["episode"], 0) - 1
             self._begin(i)
@@ -215,57 +253,6 @@ class Parallel:
         """Closes every environment."""
         for env in self.envs:
             env.close()
-
-
-class _Rows:
-    """What a group observes, ``[N, A, ...]``: arrays, and tensors of the same memory by key."""
-
-    def __init__(self, group: Group, num_envs: int) -> None:
-        self.arrays = {name: spec.zero().numpy() for name, spec in group.observation_spec(num_envs).items()}
-        self.arrays["mask"] = np.zeros((num_envs, len(group.members)), bool)
-        self.tensors: Entries = {(group.name, name): torch.from_numpy(x) for name, x in self.arrays.items()}
-
-    def copy_from(self, other: _Rows) -> None:
-        for name, x in self.arrays.items():
-            x[...] = other.arrays[name]
-
-    def copy_row(self, other: _Rows, i: int) -> None:
-        for name, x in self.arrays.items():
-            x[i] = other.arrays[name][i]
-
-
-class _Team:
-    """The arrays of a group: what its agents observe now and next, and how a step ended for each."""
-
-    def __init__(self, group: Group, num_envs: int) -> None:
-        self.name, self.members, self.group = group.name, group.members, group
-        self.to_env: ToEnv = to_env(group.action)
-        self.fresh, self.next = _Rows(group, num_envs), _Rows(group, num_envs)
-        shape = (num_envs, len(group.members), 1)
-        self.reward, self.total = np.zeros(shape, np.float32), np.zeros(shape)
-        self.terminated, self.truncated = np.zeros(shape, bool), np.zeros(shape, bool)
-
-    def observe(self, rows: _Rows, i: int, observations: dict[str, Any], present: Sequence[str]) -> None:
-        """Writes row ``i``: what each agent observes, the last of those that are gone; whether it acts next."""
-        for place, name in enumerate(self.members):
-            there = name in present
-            rows.arrays["mask"][i, place] = there
-            seen = observations.get(name)
-            if "action_mask" in rows.arrays:
-                rows.arrays["action_mask"][i, place] = True if seen is None else seen["action_mask"]
-                seen = None if seen is None else seen["observation"]
-                if not rows.arrays["action_mask"][i, place].any() and not there:
-                    rows.arrays["action_mask"][i, place] = True  # of one that does not act any more
-            rows.arrays["observation"][i, place] = 0 if seen is None else self.group.observation.read(seen)
-
-    def write(self, i: int, acting: set[str], reward: dict, terminated: dict, truncated: dict) -> None:
-        """Writes the rewards and flags of row ``i``; agents that are gone stay terminated, or cut off."""
-        for place, name in enumerate(self.members):
-            acted = name in acting
-            self.reward[i, place] = float(reward.get(name, 0.0)) if acted else 0.0
-            self.terminated[i, place] = bool(terminated.get(name, False)) if acted else True
-            self.truncated[i, place] = bool(truncated.get(name, False)) if acted else False
-        self.total[i] += self.reward[i]
 
 
 def is_parallel(env: Any) -> bool:

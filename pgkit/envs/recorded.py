@@ -19,6 +19,7 @@ from pgkit.errors import UserError
 Function = Callable[..., Sequence[Tensor]]
 Find = Callable[[], list[Slot]]
 _MOST = 20_000  # operations that are worth compiling
+_WORDS = {"advance": "the step", "renew": "the resets"}
 
 
 class Call(NamedTuple):
@@ -106,12 +107,17 @@ class Recorded:
             return [x.contiguous() for x in (*results, *[found[paths[0]] for paths in self._paths])]
 
         others = [(None, *call.inputs, *self._state(call.before)) for call in calls]
+        if any(x.device.type != "cpu" for x in first.inputs):
+            raise RuntimeError("it is not on the CPU")
         if wrong := [call.wrong for call in calls if call.wrong]:
             raise RuntimeError(wrong[0])
         for call, arguments in zip(calls, others, strict=True):
             self._check(call, pure, arguments)
         door = compiled(every_branch(pure, *others[0]), {}, lambda *_: others[1:], mode, name, most=_MOST, fixed=True)
-        self._run = door.bind(*others[0])
+        try:
+            self._run = door.bind(*others[0])
+        except UserError as error:
+            raise RuntimeError(str(error.__cause__)) from error
         self.rung, self.seconds = door.rung, door.seconds
 
     def _state(self, values: dict[str, Any]) -> list[Tensor]:
@@ -218,7 +224,7 @@ def record(
     """The functions that can be recorded, by name; a log line for each that cannot.
 
     Args:
-        functions: of a twin, an object of the recording's own.
+        functions: of a twin, an object of the recording's own: its ``advance`` and its ``renew``.
         find: lists what the twin holds.
         play: calls the functions that it is given, in a way that takes all branches.
         num_envs: number of environments.

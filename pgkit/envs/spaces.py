@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from logging import getLogger
 from operator import itemgetter
 from typing import Any, NamedTuple
 
@@ -15,13 +14,14 @@ import torch
 from gymnasium import spaces
 from torchrl.data import Binary, Bounded, Categorical, MultiCategorical, TensorSpec, Unbounded
 
+from pgkit.envs import parts
+from pgkit.envs.once import warn_once
 from pgkit.errors import UserError
 
 TAKEN = (
     "action", "action_log_prob", "reward", "done", "terminated", "truncated", "next", "is_init", "recurrent_state",
     "episode_reward", "step_count", "advantage", "value_target", "state_value", "loc", "scale", "logits", "collector",
 )  # fmt: skip
-_ARRAYS = (spaces.Box, spaces.MultiBinary)  # whose observations are arrays
 
 
 class Entry(NamedTuple):
@@ -54,43 +54,21 @@ class Entry(NamedTuple):
 def observation_entries(space: gym.Space, flatten: bool = True) -> list[Entry]:
     """The entries that an observation of ``space`` becomes, all ``observation`` unless ``flatten`` is False.
 
-    Images (uint8 of two dimensions and more) keep their type; all else that is one vector is float32.
+    Images (uint8 of two dimensions and more) keep their type; all else that is one vector is float32. What holds no
+    numbers (text, sequences, another library's spaces) is left out, with a warning.
 
     Raises:
-        UserError: the space cannot become a vector; or with ``flatten=False``, it is no Dict, or an entry has a name
+        UserError: the space holds no numbers; or with ``flatten=False``, it is no Dict, or an entry has a name
             that rollouts use.
     """
-    if not isinstance(space, gym.Space):
-        raise UserError(f"the observation space is a {type(space).__name__}, no gymnasium.spaces.Space: set one")
     if not flatten:
         return _apart(space)
     if isinstance(space, spaces.Box):
         image = space.dtype == np.uint8 and len(space.shape) > 1
         return [_box("observation", space, np.uint8 if image else np.float32, itself)]
-    if not _flattens(space):
-        raise UserError(f"the observation space {space} cannot become one vector: encode it in a wrapper")
-    parts = space.spaces if isinstance(space, spaces.Dict) else {}
-    if images := [name for name, x in parts.items() if x.dtype == np.uint8 and len(x.shape or ()) > 1]:
-        getLogger("pgkit").warning(
-            "the observation's image '%s' is flattened with the rest: envs.make(..., flatten=False) keeps it apart",
-            images[0],
-        )
-    if "action_mask" in parts:
-        getLogger("pgkit").warning(
-            "the observation's action_mask is flattened with the rest and masks nothing: "
-            "envs.make(..., flatten=False) keeps it apart"
-        )
-    size = (spaces.flatdim(space),)
-    if parts and all(isinstance(x, _ARRAYS) for x in parts.values()):
-        return [Entry("observation", size, np.float32, partial(_join, tuple(parts)), partial(_join_all, tuple(parts)))]
-    return [Entry("observation", size, np.float32, partial(spaces.flatten, space), None)]
-
-
-def _flattens(space: gym.Space) -> bool:
-    try:
-        return space.is_np_flattenable
-    except NotImplementedError:  # a space of another library
-        return False
+    if isinstance(space, spaces.Text):  # by itself
+        return [Entry("observation", (spaces.flatdim(space),), np.float32, partial(spaces.flatten, space), None)]
+    return [_flat("observation", space, itself, apart="envs.make(..., flatten=False) keeps it apart")]
 
 
 def _apart(space: gym.Space) -> list[Entry]:
@@ -101,17 +79,48 @@ def _apart(space: gym.Space) -> list[Entry]:
         )
     if taken := [name for name in space if name in TAKEN]:
         raise UserError(f"the observation's entry '{taken[0]}' has a name that rollouts use: rename it in a wrapper")
+    numeric = [name for name in space if any(parts.reader(leaf) for _, leaf in parts.leaves(space[name]))]
+    _say_left_out(space, [name for name in space if name not in numeric], bool(numeric))
     entries = []
-    for name, part in space.items():
-        get = itemgetter(name)
+    for name in numeric:
+        part, get = space[name], itemgetter(name)
         if isinstance(part, spaces.Box):
             dtype = np.float32 if np.issubdtype(part.dtype, np.floating) else part.dtype.type
             entries.append(_box(name, part, dtype, get))
         elif isinstance(part, spaces.MultiBinary):
             entries.append(Entry(name, part.shape, np.bool_, get, get))
         else:
-            entries.append(Entry(name, (spaces.flatdim(part),), np.float32, partial(_one_hot, name, part), None))
+            entries.append(_flat(name, part, get, apart="lift it to the top of the Dict in a wrapper"))
     return entries
+
+
+def _flat(name: str, space: gym.Space, get: Callable[[Any], Any], apart: str) -> Entry:
+    """All numbers of a space as one vector, in the order of ``gymnasium.spaces.flatten``."""
+    leaves = [(path, leaf) for path, leaf in parts.leaves(space) if parts.reader(leaf) is not None]
+    _say_left_out(space, [path for path, leaf in parts.leaves(space) if (path, leaf) not in leaves], bool(leaves))
+    named = {".".join(map(str, path)): leaf for path, leaf in leaves}
+    for path, leaf in named.items():
+        if path and isinstance(leaf, spaces.Box) and len(leaf.shape) > (1 if leaf.dtype == np.uint8 else 2):
+            warn_once(f"the observation's image '{path}' is flattened with the rest: {apart}")
+    if "action_mask" in named:
+        warn_once(
+            "the observation's action_mask is flattened with the rest and masks nothing: envs.make(..., flatten=False) "
+            "keeps it apart"
+        )
+    joined = parts.Joined(leaves)
+    read_all = partial(_nested, joined.all, get) if joined.is_arrays else None
+    return Entry(name, (joined.size,), np.float32, joined if get is itself else partial(_nested, joined, get), read_all)
+
+
+def _say_left_out(space: gym.Space, left_out: Sequence[Any], some_stay: bool) -> None:
+    if not some_stay:
+        raise UserError(
+            f"the observation space {space!s:.200} holds no numbers and cannot become one vector: "
+            "encode it in a wrapper"
+        )
+    for path in left_out:
+        name = path if isinstance(path, str) else ".".join(map(str, path))
+        warn_once(f"the observation's entry '{name}' holds no numbers and is left out: encode it in a wrapper")
 
 
 def _box(name: str, space: spaces.Box, dtype: Any, get: Callable[[Any], Any]) -> Entry:
@@ -124,21 +133,13 @@ def itself(obs: Any) -> Any:
     return obs
 
 
+def _nested(read: Callable[[Any], Any], get: Callable[[Any], Any], obs: Any) -> Any:
+    return read(get(obs))
+
+
 def _lifted(get: Callable[[Any], Any], obs: Any) -> Any:
     """A single number as a vector of one."""
-    return np.reshape(get(obs), 1)
-
-
-def _one_hot(name: str, space: gym.Space, obs: Any) -> Any:
-    return spaces.flatten(space, obs[name])
-
-
-def _join(names: tuple[str, ...], obs: Any) -> Any:
-    return np.concatenate([np.ravel(obs[name]) for name in names])
-
-
-def _join_all(names: tuple[str, ...], obs: Any) -> Any:
-    return np.concatenate([np.reshape(obs[name], (len(obs[name]), -1)) for name in names], 1)
+    return parts.numbers(get(obs), ()).reshape(1)
 
 
 @dataclass(frozen=True)
@@ -177,7 +178,11 @@ def action_spec(space: gym.Space, num_envs: int) -> TensorSpec:
     if isinstance(space, spaces.Box):
         low, high = (torch.as_tensor(x, dtype=torch.float32) for x in (space.low, space.high))
         shape = torch.Size((num_envs, *space.shape))
-        if not (np.isfinite(space.low).all() and np.isfinite(space.high).all()):
+        if not shape.numel():
+            raise UserError(
+                f"the action space has shape {space.shape}, which leaves nothing to decide: give one action"
+            )
+        if not (low.isfinite().all() and high.isfinite().all()):
             return Unbounded(shape, dtype=torch.float32)
         return Bounded(low.expand(shape), high.expand(shape), shape, dtype=torch.float32)
     if isinstance(space, spaces.Discrete):
@@ -194,4 +199,4 @@ def action_spec(space: gym.Space, num_envs: int) -> TensorSpec:
 
 
 def _not_supported(space: gym.Space) -> UserError:
-    return UserError(f"action space {space} is not supported: Box, Discrete, MultiDiscrete and MultiBinary are")
+    return UserError(f"action space {space!s:.100} is not supported: Box, Discrete, MultiDiscrete and MultiBinary are")

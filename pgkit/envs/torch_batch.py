@@ -10,14 +10,14 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs import EnvBase
 
 from pgkit.compiled import Mode
 from pgkit.envs.failures import FAILURES, fail, in_vector
 from pgkit.envs.numpy_entries import as_path
 from pgkit.envs.seeding import episode_seed
 from pgkit.envs.spaces import ToEnv
-from pgkit.envs.torch_halves import native
+from pgkit.envs.torch_halves import innermost, native
 from pgkit.errors import UserError
 from pgkit.seams import Entries, Key, Step
 
@@ -57,7 +57,7 @@ class Torch:
         self._one = not env.batch_size
         self.num_envs = n = env.batch_size.numel()
         self.device = torch.device(env.device or "cpu")
-        self.resume: Literal["exact", "new episodes"] = getattr(type(_inner(env)), "resume", "new episodes")
+        self.resume: Literal["exact", "new episodes"] = getattr(type(innermost(env)), "resume", "new episodes")
         observed, infos = self._many(env.full_observation_spec), Composite(shape=(n,))
         keys = {_key(key): isinstance(observed[key].zero(), Tensor) for key in observed.keys(True, True)}
         if missing := [key for key in info if not keys.get(key)]:
@@ -92,7 +92,7 @@ class Torch:
 
     def _restart(self, seed: int) -> None:
         self.seed, self._steps = seed, 0
-        self.env.set_seed(seed)
+        self.env.set_seed(seed % (2**31 - self.num_envs))  # TorchRL adds to it; 31 bits
         self._data: TensorDictBase | None = None  # what the next step is made with
         self._untouched = False
         self._begin_counts()
@@ -141,7 +141,7 @@ class Torch:
         try:
             after, self._data = self._advance(data)
         except FAILURES as error:
-            fail(in_vector(_inner(self.env), self.first, self.num_envs, self._steps + 1, self.seed), error)
+            fail(in_vector(innermost(self.env), self.first, self.num_envs, self._steps + 1, self.seed), error)
         self._untouched = False
         self._steps += 1
         reward = self._entries(after, self.reward_spec)
@@ -173,14 +173,24 @@ class Torch:
 
     def _entries(self, data: TensorDictBase, spec: Composite) -> Entries:
         found = {_key(key): data.get(key) for key in spec.keys(True, True)}
-        return {key: x.unsqueeze(0) for key, x in found.items()} if self._one else found
+        found = {key: x.unsqueeze(0) for key, x in found.items()} if self._one else found
+        for key, x in found.items():
+            if x.shape != spec[key].shape:
+                raise self._wrong(key, x, tuple(spec[key].shape))
+        return found
+
+    def _wrong(self, key: Key, x: Tensor, expected: Any) -> UserError:
+        found, name = f"of shape {tuple(x.shape)} and type {x.dtype}", ".".join(as_path(key))
+        return UserError(f"{type(innermost(self.env)).__name__} gave '{name}' {found}, its spec says {expected}")
 
     def _flags(self, after: TensorDictBase) -> tuple[Entries, Entries]:
         terminated, truncated = {}, {}
         for path in self._ends:
             done, ended = after.get((*path, "done")), after.get((*path, "terminated"), None)
-            ended = done if ended is None else ended
-            cut = after.get((*path, "truncated"), None)
+            ended, cut = done if ended is None else ended, after.get((*path, "truncated"), None)
+            for name, x in (("done", done), ("terminated", ended), ("truncated", done if cut is None else cut)):
+                if x.dtype != torch.bool or x.shape != done.shape:
+                    raise self._wrong((*path, name), x, f"bool {tuple(done.shape)}")
             cut = done & ~ended if cut is None else cut
             both = (ended.unsqueeze(0), cut.unsqueeze(0)) if self._one else (ended, cut)
             terminated[_key((*path, "terminated"))], truncated[_key((*path, "truncated"))] = both
@@ -188,7 +198,7 @@ class Torch:
 
     def state_dict(self) -> dict[str, Any]:
         """The environment's own state, and with ``resume = "exact"`` what its next step is made with."""
-        own = [copy.deepcopy(env.state_dict()) for env in dict.fromkeys((self.env, _inner(self.env)))]
+        own = [copy.deepcopy(env.state_dict()) for env in dict.fromkeys((self.env, innermost(self.env)))]
         state: dict[str, Any] = {"steps": self._steps, "env": own}
         if self.resume == "exact":
             state |= {
@@ -203,7 +213,9 @@ class Torch:
         seed, begins = self.seed, not exact and state["steps"]
         self._restart(episode_seed(seed, self.first, state["steps"]) if begins else seed)
         self.seed, self._steps = seed, state["steps"]
-        for env, own in zip(dict.fromkeys((self.env, _inner(self.env))), state.get("env", ()), strict="env" in state):
+        for env, own in zip(
+            dict.fromkeys((self.env, innermost(self.env))), state.get("env", ()), strict="env" in state
+        ):
             env.load_state_dict(own)
         if exact and state["data"] is not None:
             self._data = TensorDict(state["data"], batch_size=self.env.batch_size, device=self.env.device)
@@ -215,13 +227,6 @@ class Torch:
         """Closes the environment."""
         if not self.env.is_closed:
             self.env.close()
-
-
-def _inner(env: EnvBase) -> EnvBase:
-    """The environment under its transforms, whose ``state_dict`` leaves it out."""
-    while isinstance(env, TransformedEnv):
-        env = env.base_env
-    return env
 
 
 def _key(key: Any) -> Key:

@@ -27,7 +27,7 @@ class Halves:
     """
 
     def __init__(self, env: EnvBase) -> None:
-        if vars(env).get("_torchrl_native_autoreset") or env._post_step_mdp_hooks is not None:
+        if vars(env).get("_torchrl_native_autoreset"):
             raise RuntimeError("it resets itself")
         self.env = env
         done, fresh = env.step_and_maybe_reset(env.rand_action(env.reset()))
@@ -39,6 +39,8 @@ class Halves:
         """The entries ``next`` after a step from the entries ``taken``, and those of the state after it, ``fresh``."""
         out = self.env.step(self.filled(self.taken, tensors))
         fresh = self.env._step_mdp(out)
+        if self.env._post_step_mdp_hooks is not None:  # of transforms
+            out, fresh = self.env._post_step_mdp_hooks(out, fresh)
         return [*[out.get("next").get(key) for key in self.next], *[fresh.get(key) for key in self.fresh]]
 
     def renew(self, *tensors: Tensor) -> list[Tensor]:
@@ -55,12 +57,13 @@ class Halves:
 
     def held(self) -> list[Slot]:
         """The tensors and numbers of the environment and of what it is made of, but for torch's and TorchRL's own."""
-        return list(walk(self.env, {_package(self.env)}))
+        package = type(innermost(self.env)).__module__.partition(".")[0]
+        return list(walk(self.env, {package}))
 
 
 def native(env: EnvBase, mode: Mode) -> tuple[Halves, Native] | None:
     """The halves of an environment's step, recorded on a copy of it; None where it cannot be recorded."""
-    kind = type(env).__name__
+    kind = type(innermost(env)).__name__
     with falls_back(f"the step of {kind}", mode), torch.random.fork_rng():
         twin = Halves(copy.deepcopy(env))
 
@@ -81,7 +84,8 @@ def _leaves(data: TensorDictBase) -> list[Any]:
     return list(data.keys(True, True))
 
 
-def _package(env: EnvBase) -> str:
+def innermost(env: EnvBase) -> EnvBase:
+    """The environment under its transforms, whose ``state_dict`` leaves it out."""
     while isinstance(env, TransformedEnv):
         env = env.base_env
-    return type(env).__module__.partition(".")[0]
+    return env

@@ -69,7 +69,10 @@ class VectorEnv(EnvBase):
         mask = None if tensordict is None else tensordict.get("_reset", None)
         seed = kwargs.pop("seed", None)
         if given := [name for name, value in kwargs.items() if value is not None]:
-            raise UserError(f"reset({given[0]}=...): the environments take a seed only; give them settings when made")
+            raise UserError(
+                f"reset({given[0]}=...): the environments take a seed only; for every reset: "
+                "envs.make(..., reset_options=)"
+            )
         fresh = self.simulator.reset(seed, None if mask is None else mask.reshape(self.num_envs))
         return self._tensordict(fresh)
 

@@ -19,7 +19,6 @@ from pgkit.functional.smoothing import smoothed_action
 from pgkit.functional.soft import (
     bootstrap_target,
     ensemble_mean,
-    soft_returns,
     temperature_loss,
     twin_minimum,
 )
@@ -76,7 +75,6 @@ __all__ = [
     "sequence_log_ratio",
     "shift_images",
     "smoothed_action",
-    "soft_returns",
     "standardize",
     "straight_through_sample",
     "temperature_loss",

@@ -29,7 +29,8 @@ def discounted_sum(x: Tensor, factor: Tensor) -> Tensor:
         weight = factor[..., : steps - shift, :]
         head = torch.where(weight == 0, head, head + weight * tail)  # 0 * inf is NaN
         x = torch.cat([head, x[..., steps - shift :, :]], -2)
-        factor = factor[..., : max(steps - 2 * shift, 0), :] * factor[..., shift : steps - shift, :]
+        before, after = factor[..., : max(steps - 2 * shift, 0), :], factor[..., shift : steps - shift, :]
+        factor = torch.where(before == 0, before, before * after)
         shift *= 2
     return x
 

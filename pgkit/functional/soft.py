@@ -24,23 +24,6 @@ def ensemble_mean(q: Tensor) -> Tensor:
     return q.mean(-1)
 
 
-def soft_returns(atoms: Tensor, log_prob: Tensor, alpha: float | Tensor) -> Tensor:
-    r"""Returns under entropy regularization, :math:`z_k - \alpha \log \pi(a|s)`, from one sample of the policy.
-
-    Haarnoja et al., 2018 (https://arxiv.org/abs/1812.05905, eq. 3), for each atom of a distribution of the return.
-
-    Args:
-        atoms: :math:`z`, ``[*B, K]``, of an action drawn from the policy; an expected return is one atom.
-        log_prob: ``[*B]``, that action's log-probability.
-        alpha: temperature.
-
-    Returns:
-        ``[*B, K]``.
-    """
-    same_shape(batch_of_atoms=atoms[..., 0], log_prob=log_prob)
-    return atoms - alpha * log_prob.unsqueeze(-1)
-
-
 def bootstrap_target(
     reward: Tensor,
     next_value: Tensor,

@@ -30,7 +30,7 @@ def ratio_surrogate(log_ratio: Tensor, advantage: Tensor) -> Tensor:
     Args and result as in :func:`clip_surrogate`.
     """
     same_shape(log_ratio=log_ratio, advantage=advantage)
-    return log_ratio.exp() * advantage
+    return _ratio(log_ratio) * advantage
 
 
 def clip_surrogate(
@@ -81,7 +81,7 @@ def quadratic_surrogate(log_ratio: Tensor, advantage: Tensor, epsilon: float | T
     and result as in :func:`clip_surrogate`.
     """
     same_shape(log_ratio=log_ratio, advantage=advantage)
-    ratio = log_ratio.exp()
+    ratio = _ratio(log_ratio, _MOST / 2)  # it is squared
     return ratio * advantage - advantage.abs() / (2 * epsilon) * (ratio - 1).square()
 
 
@@ -98,7 +98,7 @@ def rollback_surrogate(
     ``slope`` is :math:`\alpha`; 0 is the clip. The other arguments and the result are as in :func:`clip_surrogate`.
     """
     same_shape(log_ratio=log_ratio, advantage=advantage)
-    ratio = log_ratio.exp()
+    ratio = _ratio(log_ratio)
     clipped = ratio.clamp(1 - epsilon, 1 + epsilon)
     return torch.minimum(ratio * advantage, (clipped - slope * (ratio - clipped)) * advantage)
 
@@ -108,4 +108,13 @@ def approx_kl(log_ratio: Tensor) -> Tensor:
 
     Unbiased and never negative (Schulman, "Approximating KL divergence", 2020, estimator k3). Any shape, unreduced.
     """
-    return torch.expm1(log_ratio) - log_ratio
+    return torch.expm1(log_ratio.clamp(max=_MOST)) * _beyond(log_ratio, _MOST) - log_ratio
+
+
+def _ratio(log_ratio: Tensor, most: float = _MOST) -> Tensor:
+    """``exp(log_ratio)``, continued from ``most`` on by its tangent: value and gradient are finite, and rise."""
+    return log_ratio.clamp(max=most).exp() * _beyond(log_ratio, most)
+
+
+def _beyond(log_ratio: Tensor, most: float) -> Tensor:
+    return 1 + (log_ratio - most).clamp(min=0)

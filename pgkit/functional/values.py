@@ -71,6 +71,6 @@ def _centered(x: Tensor, mask: Tensor | None, dim: Sequence[int] | None = None) 
         y = y if mask is None else y.masked_fill(~mask, 0.0)  # a masked element may be NaN
         return y.sum(axes, keepdim=dim is not None)
 
-    count = total(torch.ones_like(x))
+    count = total(torch.ones_like(x)).clamp_min(1)  # where none counts, the mean is 0
     centered = x - total(x) / count
     return centered, total(centered.square()), count

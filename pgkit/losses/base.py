@@ -47,10 +47,22 @@ class Loss(LossModule):
                 )
         super().convert_to_functional(module, module_name, *args, **kwargs)
 
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        """``forward``; a ``UserError`` for an empty batch."""
+        for batch in args[:1]:
+            if isinstance(batch, TensorDictBase) and not batch.batch_size.numel():
+                raise UserError(f"{type(self).__name__} got an empty batch {list(batch.batch_size)}: give it rows")
+        return super().__call__(*args, **kwargs)
+
     def __getattr__(self, item: str) -> Any:
         if item.startswith("target_") and item.endswith("_params") and self._modules.get(item) is None:
             return getattr(self, item.removeprefix("target_")).detach()  # LossModule's .data is hidden from a recording
         return super().__getattr__(item)
+
+    def register_buffer(self, name: str, tensor: Tensor | None, persistent: bool = True) -> None:
+        """As in torch, on the device of the networks: a CUDA graph takes nothing from another."""
+        device = next((p.device for p in self.parameters()), None)
+        super().register_buffer(name, tensor if tensor is None else tensor.to(device=device), persistent)
 
     def _reads(self) -> list[NestedKey]:
         """Every entry that ``forward`` reads; a key may come twice."""
@@ -101,3 +113,10 @@ class Loss(LossModule):
     def average(self, entry: Tensor, batch: TensorDictBase) -> Tensor:
         """The metric ``[]`` of an entry ``[*B]`` or ``[*B, 1]``: its mean without gradient, padded entries left out."""
         return self._reduce_loss(entry.detach(), batch, reduction="mean")
+
+
+def masks_of(keys: tuple[NestedKey, ...], action: Any, mask_key: Any) -> tuple[NestedKey, ...]:
+    """TorchRL's masks, and that of the group whose actions these are: its agents that are gone do not count."""
+    first = listed(action)[0]
+    grouped = not isinstance(first, str) and mask_key == "auto"
+    return (*keys, (*first[:-1], "mask")) if grouped else keys

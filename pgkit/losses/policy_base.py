@@ -23,9 +23,10 @@ from pgkit.functional import (
     standardize,
     value_loss,
 )
+from pgkit.functional.modes import in_evaluation
 from pgkit.functional.values import Distance
 from pgkit.losses.actors import need_distribution
-from pgkit.losses.base import Loss
+from pgkit.losses.base import Loss, masks_of
 
 
 class PolicySettings(TypedDict, total=False):
@@ -48,6 +49,9 @@ class PolicyLoss(Loss):
     It holds both networks as TorchRL losses do (``actor_network``, ``actor_network_params``, ...), names the keys,
     and gives subclasses verbs: :meth:`distribution`, :meth:`log_prob`, :meth:`log_ratio`, :meth:`kl`, :meth:`value`;
     and :meth:`result`, or its parts :meth:`add_entropy` and :meth:`add_critic`.
+
+    The actor is evaluated in evaluation mode (no dropout, normalization by running statistics), as it collects: the
+    first ratio is 1. The critic keeps the mode that it was given in.
 
     Args:
         actor_network: probabilistic actor.
@@ -123,7 +127,7 @@ class PolicyLoss(Loss):
 
     def distribution(self, batch: TensorDictBase) -> Distribution:
         """The policy's distribution at the batch's observations; the batch is left as it is."""
-        with self.actor_network_params.to_module(self.actor_network):
+        with self.actor_network_params.to_module(self.actor_network), in_evaluation(self.actor_network):
             entries = batch.select(*self.actor_network.in_keys, strict=False)  # a composite's "params" it writes itself
             return self.actor_network.get_dist(entries)
 
@@ -154,8 +158,9 @@ class PolicyLoss(Loss):
 
     def keep_distribution(self, batch: TensorDictBase) -> TensorDictBase:
         """Writes the policy's distribution into the batch (``loc`` and ``scale``, or ``logits``), as of now."""
-        with torch.no_grad(), self.actor_network_params.to_module(self.actor_network):
-            out = self.actor_network.get_dist_params(batch.select(*self.actor_network.in_keys))
+        actor = self.actor_network
+        with torch.no_grad(), self.actor_network_params.to_module(actor), in_evaluation(actor):
+            out = actor.get_dist_params(batch.select(*actor.in_keys))
         return batch.update(out.select(*self.distribution_keys))
 
     @property
@@ -229,10 +234,7 @@ class PolicyLoss(Loss):
         return torch.stack([self._expand_loss_mask(x, entry) for x in found]).all(0) if found else None
 
     def _loss_mask_keys(self) -> tuple[NestedKey, ...]:
-        """TorchRL's, and the mask of the group whose actions these are: its agents that are gone do not count."""
-        action, keys = listed(self.tensor_keys.action)[0], super()._loss_mask_keys()
-        grouped = not isinstance(action, str) and self.loss_mask_key == "auto"
-        return (*keys, (*action[:-1], "mask")) if grouped else keys
+        return masks_of(super()._loss_mask_keys(), self.tensor_keys.action, self.loss_mask_key)
 
     def result(self, batch: TensorDictBase, objective: Tensor, dist: Distribution) -> TensorDict:
         """Losses and metrics of an unreduced ``objective [*B, 1]``, to be maximized; of entropy and value too."""

@@ -18,7 +18,7 @@ from pgkit.errors import UserError, within
 from pgkit.functional import bootstrap_target
 from pgkit.heads import Head, Returns, Scalar
 from pgkit.losses.actors import PROBABILISTIC
-from pgkit.losses.base import Loss
+from pgkit.losses.base import Loss, masks_of
 
 Critics = TensorDictModule | Sequence[TensorDictModule]
 Members = Tensor | slice | None
@@ -100,7 +100,6 @@ class QLoss(Loss):
     ) -> None:
         super().__init__(reduction)
         within(0, 1, gamma=gamma)
-        self.register_coeff_buffer("gamma", gamma, dtype=torch.float64)
         self.delay_actor, self.delay_qvalue, self.augmented = delay_actor, delay_qvalue, augmented
         self.convert_to_functional(actor_network, "actor_network", create_target_params=delay_actor)
         networks, self.num_critics, self._together = _arranged(qvalue_network, num_qvalue_nets)
@@ -112,7 +111,12 @@ class QLoss(Loss):
             create_target_params=delay_qvalue,
             compare_against=list(actor_network.parameters()) if separate_losses else None,
         )
+        self.register_coeff_buffer("gamma", gamma, dtype=torch.float64)
         self._make_vmap()
+        self.group = group_of(networks[0])
+        if self.group:
+            below = ("action", "reward", "state_action_value")
+            self.set_keys(**{name: (*self.group, name) for name in below})
         if isinstance(actor_network, PROBABILISTIC):
             self.set_keys(action=actor_network.dist_sample_keys[0], log_prob=actor_network.log_prob_keys[0])
 
@@ -154,7 +158,10 @@ class QLoss(Loss):
         return out
 
     def evaluate(self, data: TensorDictBase, key: NestedKey, params: Any, members: Members = None) -> Tensor:
-        """The critics' entry ``key`` as ``[*B, critics, size]``, whether one network writes it or each its own."""
+        """The critics' entry ``key`` as ``[*B, critics, size]``, whether one network writes it or each its own.
+
+        Of a group of agents ``[*B, agents, critics, size]``; so has all else here that is for each row.
+        """
         if key not in self.qvalue_network.out_keys:
             raise UserError(
                 f"{type(self).__name__} reads '{key}' of its critics, they write "
@@ -162,14 +169,15 @@ class QLoss(Loss):
             )
         if members is not None:
             params, members = self._params_of(params, members)
+        dims = data.dim() + bool(self.group)
         if self._together:
             with params.to_module(self.qvalue_network, preserve_module_state=False):
                 out = self.qvalue_network(data).get(key)
-            out = out.unsqueeze(data.dim()) if self.num_critics == 1 else out  # [*B, size]
+            out = out.unsqueeze(dims) if self.num_critics == 1 else out  # [*B, size]
         else:
             each: Any = self._each
-            out = each(data, params).get(key).movedim(0, data.dim())
-        out = out.unsqueeze(-1) if out.dim() == data.dim() + 1 else out.flatten(data.dim() + 1)
+            out = each(data, params).get(key).movedim(0, dims)
+        out = out.unsqueeze(-1) if out.dim() == dims + 1 else out.flatten(dims + 1)
         return out if members is None else out[..., members, :]
 
     def _params_of(self, params: Any, members: Tensor | slice) -> tuple[Any, Members]:
@@ -205,10 +213,13 @@ class QLoss(Loss):
         Of a number ``[*B]`` or of a distribution of returns; of augmented copies, the mean over them.
         """
         keys, after = self.tensor_keys, batch["next"]
-        reward, terminated = (after[key].reshape(batch.batch_size) for key in (keys.reward, keys.terminated))
+        own = (*self.group, "terminated")  # an agent's own end, where the environment has one
+        ends = own if self.group and own in after.keys(True, True) else keys.terminated
+        reward = self.by_row(after[keys.reward], batch)
+        terminated = self.by_row(after[ends], batch).expand_as(reward)
         gamma, steps = self.gamma.to(next_value.dtype), batch.get(keys.steps_to_next_obs, None)
         if steps is not None:  # TorchRL's MultiStep drops the 1; a power of whole numbers would be float32 for any
-            steps = steps.reshape(batch.batch_size).to(gamma.dtype)
+            steps = self.by_row(steps, batch).expand_as(reward).to(gamma.dtype)
         target: Any = bootstrap_target(reward, next_value, terminated, gamma, steps)
         if self.augmented:
             target = target.mixed() if isinstance(target, Returns) else target.mean(0, keepdim=True).expand_as(target)
@@ -226,11 +237,18 @@ class QLoss(Loss):
         self.write_priority(batch, q - target.mean.unsqueeze(-1))
         weight = batch.get(self.tensor_keys.priority_weight, None)
         loss = self.head.loss(outputs, target).sum(-1)
-        return self.reduce(loss if weight is None else loss * weight.reshape(batch.batch_size), batch), q
+        return self.reduce(loss if weight is None else loss * self.by_row(weight, batch), batch), q
+
+    def by_row(self, entry: Tensor, batch: TensorDictBase) -> Tensor:
+        """An entry without its trailing 1, ``[*B]``; of a group ``[*B, agents]``, or ``[*B, 1]`` of what all share."""
+        return entry.reshape(*batch.batch_size, -1) if self.group else entry.reshape(batch.batch_size)
+
+    def _loss_mask_keys(self) -> tuple[NestedKey, ...]:
+        return masks_of(super()._loss_mask_keys(), self.tensor_keys.action, self.loss_mask_key)
 
     def write_priority(self, batch: TensorDictBase, td_error: Tensor) -> None:
-        """Writes the largest error of the critics, ``[*B, critics]`` in absolute value, into the batch."""
-        batch.set(self.tensor_keys.priority, td_error.detach().abs().amax(-1))
+        """Writes the largest error of the critics, of agents too, in absolute value, into the batch."""
+        batch.set(self.tensor_keys.priority, td_error.detach().abs().flatten(batch.dim()).amax(-1))
 
     def first(self, batch: Any) -> Any:
         """What the actor learns on, of a batch or a tensor: all of it, of augmented copies the first."""
@@ -261,6 +279,12 @@ def _arranged(critics: Critics, number: int) -> tuple[list[Any], int, bool]:
     if len(networks) == 1 and (several or number == 1 or own is not None):
         return networks, own or 1, True
     return networks, len(networks) if several else number, False
+
+
+def group_of(critic: Any) -> tuple[str, ...]:
+    """The path of the group of agents that a critic is for: ``("agents",)``; ``()`` of one agent."""
+    value = next((key for key in critic.out_keys if key[-1] == "state_action_value"), "state_action_value")
+    return () if isinstance(value, str) else value[:-1]
 
 
 def head_of(critics: Critics) -> Head | None:

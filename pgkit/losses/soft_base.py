@@ -96,7 +96,8 @@ class SoftQLoss(QLoss):
             self.temperature: Any = _checked(temperature)
         else:  # where the target is not known yet, each batch adds it to 0
             bounds = {"min_alpha": min_alpha, "max_alpha": max_alpha}
-            self.temperature = Temperature(target or 0.0, alpha_init, **bounds, trained=not fixed_alpha)
+            made = Temperature(target or 0.0, alpha_init, **bounds, trained=not fixed_alpha)
+            self.temperature = made.to(next(self.parameters()).device)
             if fixed_alpha:  # by TorchRL's name
                 self.register_buffer("log_alpha", self.temperature.log_alpha)
             else:

@@ -77,10 +77,9 @@ class TD3Loss(QLoss):
         self.set_distance(loss_function)
         low, high = bounds or _bounds(action_spec_of(actor_network, self.tensor_keys.action, action_spec))
         numbers = {"min_action": low, "max_action": high, "policy_noise": policy_noise, "noise_clip": noise_clip}
-        device = next(self.parameters()).device  # a spec's bounds may lie elsewhere
         for name, number in numbers.items():
             exact = number if isinstance(number, Tensor) else torch.tensor(number, dtype=torch.float64)
-            self.register_buffer(name, exact.to(device))
+            self.register_buffer(name, exact)
 
     def _writes(self) -> list[NestedKey]:
         metrics = ["pred_value", "state_action_value_actor", "next_state_value", "target_value"]

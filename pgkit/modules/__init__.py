@@ -23,6 +23,7 @@ from pgkit.modules.projection import WeightProjection
 from pgkit.modules.q_values import QValue, discrete_q_value, q_value
 from pgkit.modules.recurrent import gru, lstm
 from pgkit.modules.tokens import TokenActor, TokenDistribution, TokenPolicy, TokenValue
+from pgkit.modules.trunk import FlatMatrix
 from pgkit.modules.values import state_value
 
 __all__ = [
@@ -34,6 +35,7 @@ __all__ = [
     "EnsembleLayerNorm",
     "EnsembleLinear",
     "EnsembleRMSNorm",
+    "FlatMatrix",
     "GaussianExploration",
     "NoiseRepeat",
     "ObsNormalizer",

@@ -127,13 +127,28 @@ class ReturnScale(RunningMoments):
     Give it to :class:`pgkit.advantages.GAE` (``return_scale=``): the critic's output is then in units of
     :attr:`scale`, the advantage stays in the rewards' unit. Call :meth:`update` once a rollout.
 
+    An outlier does not set the scale for good: a return enters as no further than ``clip`` deviations from the mean. In
+    the first update middle and deviation are the batch's median and typical distance, as in :class:`ObsNormalizer`.
+
     Args:
+        clip: far above the spread of rewards that are rare but real.
         shape: ``()``, one scale for all; ``(agents, 1)``, one for each agent of a group.
         device: where it lives.
     """
 
-    def __init__(self, shape: Sequence[int] = (), *, device: torch.device | str | None = None) -> None:
+    def __init__(
+        self, shape: Sequence[int] = (), *, clip: float = 1_000.0, device: torch.device | str | None = None
+    ) -> None:
         super().__init__(shape, device)
+        self.clip = clip
+
+    def _take(self, x: Tensor) -> None:
+        if self.count > 0:
+            middle, deviation = self.mean, self.scale
+        else:
+            middle = _order(x, 0.5)
+            deviation = _typical_distance(x - middle)
+        super()._take(x.clamp(middle - self.clip * deviation, middle + self.clip * deviation))
 
     @property
     def scale(self) -> Tensor:

@@ -13,6 +13,8 @@ from torchrl.envs import EnvBase
 
 from pgkit.errors import UserError
 
+LARGEST_BOUND = 1e6  # of an action; beyond it bounds stand for none
+
 
 def observation_spec(env: Any, key: NestedKey = "observation") -> TensorSpec:
     """Spec of one observation, without the environment's batch dimensions; of a group's entry, of all its agents."""
@@ -58,9 +60,27 @@ def box_action(spec: TensorSpec, needs_bounds: bool = False) -> TensorSpec:
             f"actions have shape {tuple(spec.shape)}, the actors here write flat ones: flatten them in the environment "
             "(gymnasium.wrappers.TransformAction)"
         )
-    if needs_bounds and not isinstance(spec, Bounded):
-        raise UserError("the action space has no bounds to squash into: use modules.gaussian_actor, or bound the Box")
+    if needs_bounds:
+        _check_bounds(spec)
     return spec
+
+
+def _check_bounds(spec: Any) -> None:
+    """A ``UserError`` for bounds that no squashed action can have."""
+    advice = "use modules.gaussian_actor, or bound the Box"
+    if not isinstance(spec, Bounded):
+        raise UserError(f"the action space has no bounds to squash into: {advice}")
+    space: Any = spec.space
+    for i, (low, high) in enumerate(zip(space.low.tolist(), space.high.tolist(), strict=True)):
+        if not low < high:
+            raise UserError(
+                f"action {i} is bounded to [{low:g}, {high:g}], which leaves no choice: take it out of the action space"
+            )
+        if max(abs(low), abs(high)) > LARGEST_BOUND:
+            raise UserError(
+                f"action {i} is bounded to [{low:g}, {high:g}], too wide to squash into (at most {LARGEST_BOUND:g} "
+                f"from 0): {advice} (gymnasium.wrappers.RescaleAction(env, -1, 1))"
+            )
 
 
 def layer_sizes(hidden: Sequence[int]) -> list[int]:

@@ -11,6 +11,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from pgkit.errors import UserError
+from pgkit.functional.modes import in_evaluation
 from pgkit.modules.groups import AgentIds, Agents, AllAgents, ForEachAgent
 from pgkit.modules.mlp import mlp
 from pgkit.modules.sizes import flat_size, observation_spec
@@ -46,13 +47,16 @@ def trunk(
 ) -> Trunk:
     """The modules before a head: normalizer, all agents' observations side by side, agent ids, hidden layers.
 
-    An encoder stands in place of the hidden layers, right after the normalizer.
+    An encoder stands in place of the hidden layers, right after the normalizer. Without one, a matrix is flattened.
     """
     key = who.key("observation") if isinstance(centralized, bool) else centralized
     before = [] if normalizer is None else [normalizer]
     between, after, width = _team(who, centralized)
     if encoder is None:
-        size = width * flat_size(who.observation(key).shape, key) + who.number * who.ids
+        shape = who.observation(key).shape
+        if len(shape) == 2:
+            before, shape = [*before, FlatMatrix()], (shape.numel(),)
+        size = width * flat_size(shape, key) + who.number * who.ids
         layers = mlp(size, None, hidden, activation, linear=who.linear)
         return Trunk([*before, *between, layers], list(hidden)[-1] if hidden else size, [key], [], after)
     keys, states = reads(encoder, key), list(getattr(encoder, "out_keys", []))
@@ -65,6 +69,13 @@ def trunk(
         raise UserError("agent_ids= and centralized= go to the recurrent encoder's builder, which comes first")
     features = width * _features(who, encoder, keys) + who.number * who.ids
     return Trunk([*before, encoder, *between], features, keys, states, after)
+
+
+class FlatMatrix(nn.Module):
+    """Matrices ``[*B, rows, columns]`` as vectors ``[*B, rows * columns]``; bytes become floats."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return (x if x.is_floating_point() else x.to(torch.get_default_dtype())).flatten(-2)
 
 
 def headed(
@@ -136,19 +147,14 @@ def _features(who: Agents, encoder: Any, keys: Sequence[NestedKey]) -> int:
     """How many features an encoder gives for an observation."""
     device = next((p.device for p in encoder.parameters()), who.device)
     examples = [_zero(who, encoder, key).to(device) for key in keys]
-    modes = {module: module.training for module in encoder.modules()}
-    encoder.eval()  # a batch of zeros is no statistic
     try:
-        with torch.no_grad():
+        with torch.no_grad(), in_evaluation(encoder):  # a batch of zeros is no statistic
             out = first(encoder(*examples))
     except (RuntimeError, ValueError, TypeError) as error:
         found = ", ".join(str(tuple(x.shape)) for x in examples)
         raise UserError(
             f"encoder={type(encoder).__name__} cannot take an observation {found}: {str(error).splitlines()[0]}"
         ) from error
-    finally:
-        for module, training in modes.items():
-            module.training = training
     size = (1,) if who.name is None or isinstance(keys[0], str) else (1, who.number)
     if out.shape[:-1] != size:
         raise UserError(

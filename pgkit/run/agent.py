@@ -105,6 +105,12 @@ def rebuild(run_dir: Path, make: Callable[..., Agent] | None, trust: bool) -> tu
     check_imports(args, trust)
     env = args.make_env(num_envs=1, seed=args.seed)
     try:
+        played = read_config(run_dir).get("environment", env.env_id)
+        if played != env.env_id:
+            raise UserError(
+                f"{run_dir} was evaluated on {played}, its settings give {env.env_id}: make that environment in its "
+                "recipe's Args.make_env, which every command calls"
+            )
         with seeding.preserved_rng():
             return make(args, env), args, env
     finally:

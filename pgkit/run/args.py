@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
+import inspect
 import math
 import types
 import typing
@@ -150,7 +151,19 @@ def made_here(env_id: str, wrapper: str | None, modules: list[str], here: Path, 
     for module in modules:
         look_in(here, module)
     env = envs.make_one(env_id, **kwargs)
-    return env if wrapper is None else imported(wrapper)(env)
+    if wrapper is None:
+        return env
+    wrap = imported(wrapper)
+    try:
+        inspect.signature(wrap).bind(env)
+    except TypeError as error:
+        raise UserError(f"--wrapper {wrapper} is called with one environment, this cannot be: {error}") from None
+    except ValueError:  # built in
+        pass
+    wrapped = wrap(env)
+    if wrapped is None:
+        raise UserError(f"--wrapper {wrapper} returned None: return the wrapped environment")
+    return wrapped
 
 
 def told(args_class: type[RunArgs], name: str) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import torch
 from torch import nn
 
 from pgkit import files
-from pgkit.errors import UserError
+from pgkit.errors import EnvironmentFailed, UserError
 from pgkit.seams import Stateful
 
 _KINDS = {"recipe": str, "frames": int, "states": dict, "rng": dict, "counters": dict}
@@ -54,7 +54,7 @@ def restore(tracked: dict[str, Stateful], states: dict[str, Any], where: Path) -
     for name, owner in tracked.items():
         try:
             owner.load_state_dict(states[name])
-        except UserError:
+        except (UserError, EnvironmentFailed):
             raise
         except (RuntimeError, KeyError, IndexError, ValueError, TypeError, AttributeError) as error:
             reason = (str(error).strip() or "no reason given").splitlines()[-1].strip()

@@ -27,10 +27,20 @@ from pgkit.run.args import RunArgs, free_on_resume, of_type
 A = TypeVar("A", bound=RunArgs)
 PACKAGES = ("torch", "torchrl", "tensordict", "numpy", "gymnasium", "mujoco", "dm-control", "shimmy")
 _TEXT = (str, type(None))
-_KINDS = {"settings": dict, "command": list, "resumed_at": list, "id": str, "may_change": list, "file": _TEXT}
+_KINDS = {
+    "settings": dict,
+    "command": list,
+    "resumed_at": list,
+    "id": str,
+    "may_change": list,
+    "file": _TEXT,
+    "environment": str,
+}
 
 
-def write_config(path: Path, args: RunArgs, recipe: str, before: dict[str, Any] | None, identity: str) -> None:
+def write_config(
+    path: Path, args: RunArgs, recipe: str, before: dict[str, Any] | None, identity: str, environment: str
+) -> None:
     """Write ``config.json``; ``before`` is that of the run that goes on, with the frames of each resume."""
     config = {
         "recipe": recipe,
@@ -43,6 +53,7 @@ def write_config(path: Path, args: RunArgs, recipe: str, before: dict[str, Any] 
         "git_revision": git_revision(),
         "resumed_at": before["resumed_at"] if before else [],
         "id": identity,
+        "environment": environment,
     }
     write_json(path / "config.json", config)
 

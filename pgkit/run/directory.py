@@ -34,8 +34,9 @@ def _check_free(path: Path, args: RunArgs, recipe: str) -> None:
         if path.exists() and not path.is_dir():
             raise UserError(f"--run-dir {path} is a file; give a directory")
         held = holds_run(path)
-    except OSError as error:
-        raise UserError(f"--run-dir {path!s:.80}...: {error.strerror}") from error
+    except (OSError, ValueError) as error:  # the latter of names that no file can have
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise UserError(f"--run-dir {path!s:.80}...: {reason}") from error
     if held and not _can_start_over(path, args, recipe):
         go_on = (
             f"go on with it by --resume {path}" if can_resume(path) else "delete it: it has no checkpoint to go on from"

@@ -1,8 +1,9 @@
 """Evaluation: whole episodes, deterministic actions, the same number from every env slot."""
 
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from logging import getLogger
+from logging import WARNING, getLogger
 from typing import Any
 
 import numpy as np
@@ -12,30 +13,46 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from pgkit.collectors.actor import path_of, state_of
+from pgkit.collectors.policy import Act, trace
+from pgkit.compiled import Constants
 from pgkit.envs import vector_of
 from pgkit.errors import check_whole_number
+from pgkit.functional.modes import in_evaluation
 from pgkit.run.seeding import preserved_rng
 from pgkit.seams import Entries, Key
 
+RECORDED_AT, MOST_RECORDS = 20, 8  # calls of one layout before it is recorded, which takes 0.1 s; layouts
 LONGEST = 100_000  # steps of an episode; longer than those of Gymnasium, dm_control and Atari
 
 
 @contextmanager
-def _evaluating(policy: torch.nn.Module) -> Iterator[None]:
-    """Evaluation mode, and one thread: for a few rows a second thread costs more than it brings."""
-    training, threads = [(part, part.training) for part in policy.modules()], torch.get_num_threads()
-    policy.eval()
+def _without_infos() -> Iterator[None]:
+    """What can be recorded is said where the policy is trained."""
+    log = getLogger("pgkit")
+    level = log.level
+    log.setLevel(WARNING)
+    try:
+        yield
+    finally:
+        log.setLevel(level)
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """For a few rows a second thread costs more than it brings."""
+    threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
         yield
     finally:
         torch.set_num_threads(threads)
-        for part, mode in training:
-            part.training = mode
 
 
 class Acting:
-    """A policy that acts, with its memory where it is recurrent.
+    """A policy that acts, in evaluation mode, with its memory where it is recurrent.
+
+    From the 20th call for as many rows on, the policy's tensor operations are called without TensorDict: the same
+    numbers, several times faster. What changes in the policy is noticed.
 
     Args:
         policy: a TensorDict actor.
@@ -47,20 +64,54 @@ class Acting:
         self.memory = state_of(policy)
         self.device = next((x.device for x in (*policy.parameters(), *policy.buffers())), None)
         self.state: Tensor | None = None
+        self._calls = Counter[Any]()  # by layout and kind
+        self._recorded: dict[Any, Act] = {}
+        self._constants: Constants | None = None
 
     def __call__(self, entries: Mapping[Key, Tensor], begun: Tensor, deterministic: bool = True) -> Entries:
         """Actions ``[N, ...]`` by key for the entries ``[N, ...]`` that it reads; ``begun [N]``: an episode begins."""
-        batch = TensorDict(dict(entries), [len(begun)]).to(self.device)
+        inputs: Entries = dict(entries)
         if self.memory is not None:
             key, shape = self.memory
-            batch["is_init"] = begun.unsqueeze(-1).to(self.device)
-            start = torch.zeros(len(begun), *shape, device=self.device)
-            batch[key] = start if self.state is None else self.state
+            inputs["is_init"] = begun.unsqueeze(-1)
+            kept = self.state is not None and not begun.all()
+            inputs[key] = self.state if kept else torch.zeros(len(begun), *shape)
+        if self.device is not None and self.device.type != "cpu":
+            inputs = {key: x.to(self.device) for key, x in inputs.items()}
+        with torch.no_grad():
+            *actions, self.state = self._act(inputs, deterministic)(*inputs.values())
+        return dict(zip(self.keys, actions, strict=True))
+
+    def _act(self, inputs: Entries, deterministic: bool) -> Act:
+        """The policy as a function of these entries' tensors."""
+        if self._constants is not None and self._constants.changed(memory=False):
+            self._recorded.clear()
+            self._calls.clear()
+            self._constants = None
+        which = (deterministic, *[(key, x.shape) for key, x in inputs.items()])
+        if which in self._recorded:
+            return self._recorded[which]
+        act = self._function(list(inputs), deterministic)
+        self._calls[which] += 1
+        if self._calls[which] < RECORDED_AT or len(self._recorded) == MOST_RECORDS:
+            return act
+        with torch.no_grad(), torch.random.fork_rng(), _without_infos():
+            self._recorded[which] = trace(act, list(inputs.values()), self.policy)
+        self._constants = Constants({"the policy": self.policy}, but={"training"})
+        return self._recorded[which]
+
+    def _function(self, keys: list[Key], deterministic: bool) -> Act:
         kind = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
-        with torch.no_grad(), set_exploration_type(kind):
-            out = self.policy(batch)
-        self.state = None if self.memory is None else out.get(("next", *path_of(self.memory[0])), None)
-        return {key: out[key] for key in self.keys}
+
+        def act(*inputs: Tensor) -> list[Tensor]:
+            data = TensorDict(dict(zip(keys, inputs, strict=True)), inputs[0].shape[:1])
+            with in_evaluation(self.policy), set_exploration_type(kind):
+                out = self.policy(data)
+            found = [out[key] for key in self.keys]
+            none = torch.empty(0)
+            return [*found, none if self.memory is None else out.get(("next", *path_of(self.memory[0])))]
+
+        return act
 
 
 def act(policy: torch.nn.Module, obs: np.ndarray, deterministic: bool = True) -> np.ndarray:
@@ -87,7 +138,7 @@ def play(
     check_whole_number(1, episodes=episodes, longest=longest)
     env = vector_of(env)
     policy = policy if isinstance(policy, torch.nn.Module) else policy.actor
-    with preserved_rng(), _evaluating(policy):
+    with preserved_rng(), in_evaluation(policy), _one_thread():
         simulator, act = env.simulator, Acting(policy, tuple(env.action_keys))
         fresh, slots = simulator.reset(), simulator.num_envs
         share = [episodes // slots + (slot < episodes % slots) for slot in range(slots)]

@@ -189,9 +189,12 @@ def seeds(text: str) -> list[int]:
     """``1-5`` or ``1,3,7`` as numbers."""
     try:
         parts = [part.partition("-") for part in text.split(",")]
-        return [n for low, _, high in parts for n in range(int(low), int(high or low) + 1)]
+        ranges = [(int(low), int(high or low)) for low, _, high in parts]
     except ValueError:
-        raise UserError(f"--seeds {text}: give numbers and ranges such as 1-5 or 1,3,7") from None
+        raise UserError(f"--seeds {text:.100}: give numbers and ranges such as 1-5 or 1,3,7") from None
+    if any(not low <= high < min(low + 10_000, 2**62) for low, high in ranges):
+        raise UserError(f"--seeds {text:.100}: give ranges of 1 to 10,000 seeds, each below 2^62")
+    return [n for low, high in ranges for n in range(low, high + 1)]
 
 
 def describe(cell: Cell) -> str:

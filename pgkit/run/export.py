@@ -49,10 +49,17 @@ def _write_folder(policy: Policy, folder: Path) -> None:
     safetensors = needs("safetensors.torch", "export")
     if policy.args is None or policy.args.run_dir is None:
         raise UserError("a policy folder is written from a run, which says how the policy is built again: use .onnx")
-    if folder.exists() and not (folder / ABOUT).is_file() and (not folder.is_dir() or any(folder.iterdir())):
+    try:
+        there = folder.exists()
+    except OSError as error:
+        files.cannot_write(folder, error)
+    if there and not (folder / ABOUT).is_file() and (not folder.is_dir() or any(folder.iterdir())):
         raise UserError(f"{folder} holds something else: give another name")
     config, run_dir = read_config(policy.args.run_dir), policy.args.run_dir
-    folder.mkdir(exist_ok=True)
+    try:
+        folder.mkdir(exist_ok=True)
+    except OSError as error:
+        files.cannot_write(folder, error)
     if config.get("file"):  # a recipe of one's own goes along
         shutil.copyfile(run_dir / config["file"], folder / "recipe.py")
         config["file"] = "recipe.py"

@@ -17,6 +17,7 @@ import torch
 from tensordict import TensorDictBase
 
 from pgkit import files
+from pgkit.envs.once import warn_once
 from pgkit.errors import UserError
 from pgkit.run.board import Board
 
@@ -167,6 +168,8 @@ def finished_infos(rollout: TensorDictBase | None) -> dict[str, float]:
         if path[-1] in _NO_INFO or key in rollout.keys(True, True) or rollout[("next", *path)].shape != done.shape:
             continue
         ends = rollout[("next", *path)][done].double()
+        if ends.isnan().all():
+            warn_once(f"info '{'.'.join(path)}' was in no step that ended an episode: is that its name?")
         if (ends := ends[~ends.isnan()]).numel():
             found["rollout/" + ("success_rate" if path == ("is_success",) else "_".join(path))] = float(ends.mean())
     return found

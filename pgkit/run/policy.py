@@ -22,7 +22,7 @@ class Policy:
     """A policy with its observation normalizer, and the env it was trained for.
 
     ``to_env`` makes of the policy's actions what the environment takes, as in training; None leaves them. Of several
-    groups of agents it does so for the first, and ``others`` have the further groups' by the keys of their actions.
+    groups of agents ``by_group`` does so, by the keys of their actions.
     ``observation_shape`` is a mapping from names to shapes where the policy reads the entries of a Dict;
     ``observation_dtype`` names their types where they are not float32.
     """
@@ -34,11 +34,11 @@ class Policy:
     frames: int = 0
     observation_dtype: dict[Any, str] = field(default_factory=dict)
     args: RunArgs | None = None
-    others: dict[Any, Callable[[np.ndarray], np.ndarray]] = field(default_factory=dict)
+    by_group: dict[Any, Callable[[np.ndarray], np.ndarray]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self._acting = Acting(self.actor, (self.action_key, *self.others))
-        self._begins = True
+        self._acting = Acting(self.actor, tuple(self.by_group) or (self.action_key,))
+        self._begins, self._recurrent = True, self.memory is not None
 
     @classmethod
     def of(cls, actor: torch.nn.Module, env: Any) -> Policy:
@@ -73,16 +73,36 @@ class Policy:
         """An episode begins at the next :meth:`predict`: a recurrent policy forgets. No other needs it."""
         self._acting.state, self._begins = None, True
 
-    def predict(self, obs: Any, deterministic: bool = True) -> Any:
+    def predict(self, obs: Any, deterministic: bool = True, episode_start: Any = None) -> Any:
         """Action for one observation ``[*obs]``, or actions ``[N, *action]`` for a batch ``[N, *obs]``.
 
         Where the policy reads the entries of a Dict, ``obs`` is a mapping from their names to arrays. A group of agents
         has a dimension more: ``[agents, *obs]`` or ``[N, agents, *obs]``, and actions ``[agents, *action]``. Of several
         groups ``obs`` is a mapping from their names, and so is the result; what has further entries beside the
         observation, an action mask, is a mapping in it. The actions are what the environment takes: continuous ones
-        are clipped to its bounds. A wrong shape is a UserError.
+        are clipped to its bounds.
+
+        Args:
+            obs: numbers; a wrong shape is a UserError.
+            deterministic: the likeliest actions, or draws.
+            episode_start: flags ``[N]``, which rows begin an episode: there a recurrent policy forgets. None: all at
+                the first call and after :meth:`reset`, else none.
+
+        Raises:
+            UserError: wrong shapes; or a recurrent policy is given other rows in the middle of their episodes.
         """
-        shapes, given = self.shapes, self._by_key(obs)
+        entries, single = self._entries(obs)
+        begun = self._begun(len(next(iter(entries.values()))), episode_start)
+        actions = {key: x.cpu().numpy() for key, x in self._acting(entries, begun, deterministic).items()}
+        self._begins = False
+        convert: Any = self.by_group or {self.action_key: self.to_env or (lambda x: x)}
+        actions = {key: convert[key](x) for key, x in actions.items()}
+        actions = {key: x[0] if single else x for key, x in actions.items()}
+        return {key[0]: x for key, x in actions.items()} if self.by_group else actions[self.action_key]
+
+    def _entries(self, obs: Any) -> tuple[dict[Key, torch.Tensor], bool]:
+        """What the actor reads as a batch, and whether it was a single observation."""
+        given, shapes = self._by_key(obs), self.shapes
         entries, single = {}, False
         for name, shape in shapes.items():
             if name not in given:
@@ -95,15 +115,24 @@ class Policy:
                     f"predict got an {dotted(name)} of shape {list(x.shape)}; the policy takes {list(shape)} or a batch"
                 )
             entries[name] = torch.from_numpy(x[None] if single else x)
-        begun = torch.full((len(next(iter(entries.values()))),), self._begins)
-        actions = {key: x.cpu().numpy() for key, x in self._acting(entries, begun, deterministic).items()}
-        self._begins = False
-        first, converters = self.action_key, dict(self.others)
-        if self.to_env is not None:
-            converters[first] = self.to_env
-        actions = {key: converters[key](x) if key in converters else x for key, x in actions.items()}
-        actions = {key: x[0] if single else x for key, x in actions.items()}
-        return {key[0]: x for key, x in actions.items()} if self.others else actions[first]
+        return entries, single
+
+    def _begun(self, rows: int, episode_start: Any) -> torch.Tensor:
+        if episode_start is None:
+            begun = torch.full((rows,), self._begins)
+        else:
+            begun = torch.as_tensor(np.array(episode_start, bool).reshape(-1))
+            if len(begun) != rows:
+                raise UserError(
+                    f"predict got {len(begun)} flags of episode_start for {rows} observations: one for each"
+                )
+        state = self._acting.state if self._recurrent else None
+        if state is not None and len(state) != rows and not begun.all():
+            raise UserError(
+                f"predict got {rows} observations after {len(state)}, and this policy remembers each row's episode: "
+                "call reset(), or give episode_start=, one flag a row, all True where the rows are others"
+            )
+        return begun
 
     def _by_key(self, obs: Any) -> dict[Key, Any]:
         """The arrays given, by the keys that the policy reads them from."""
@@ -129,7 +158,7 @@ def dotted(key: Key) -> str:
 
 
 def _converter(spec: Any) -> ToEnv:
-    """What makes the environment's of a further group's actions."""
+    """What makes the environment's of a group's actions."""
     if not isinstance(spec, Bounded):
         return ToEnv()
     return ToEnv(spec.low.cpu().numpy(), spec.high.cpu().numpy(), np.dtype(np.float32))
@@ -137,12 +166,12 @@ def _converter(spec: Any) -> ToEnv:
 
 def describe_env(env: Any) -> dict[str, Any]:
     """What :class:`Policy` must know of an env: the observation's shape and type, and how actions become its own."""
-    spec = env.observation_spec_unbatched
+    spec, acted = env.observation_spec_unbatched, env.action_keys
     shapes = {name: tuple(spec[name].shape) for name in spec.keys(True, True)}
     dtypes = {name: str(spec[name].dtype).removeprefix("torch.") for name in shapes}
     return {
         "observation_shape": shapes["observation"] if list(shapes) == ["observation"] else shapes,
         "to_env": env.to_env,
-        "others": {key: _converter(env.full_action_spec_unbatched[key]) for key in env.action_keys[1:]},
+        "by_group": {key: _converter(env.full_action_spec_unbatched[key]) for key in acted if len(acted) > 1},
         "observation_dtype": {name: dtype for name, dtype in dtypes.items() if dtype != "float32"},
     }

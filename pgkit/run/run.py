@@ -18,7 +18,7 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
 from pgkit import files
-from pgkit.compiled import set_matmul
+from pgkit.compiled import chosen, set_matmul
 from pgkit.envs import vector_of
 from pgkit.errors import Diverged, UserError
 from pgkit.run import checkpoint, config, directory, ending, seeding
@@ -87,7 +87,7 @@ class Run:
             except BaseException:
                 directory.unlock(self._lock)
                 raise
-        self.args.threads = self.args.threads or fastest_threads()
+        self.args.threads = self.args.threads or int(chosen("threads of a run", lambda: str(fastest_threads())))
         torch.set_num_threads(self.args.threads)
         set_matmul(self.args.matmul)
         seeding.seed_everything(self.args.seed)
@@ -178,7 +178,7 @@ class Run:
         if not self._saved:
             self._lock = directory.claim(self.dir, self.args, self.recipe)
             self._claimed = True
-        config.write_config(self.dir, self.args, self.recipe, before, identity)
+        config.write_config(self.dir, self.args, self.recipe, before, identity, self._eval_env().env_id)
         self._metrics = Metrics(self.dir, upto=self.frames, identity=identity)
 
     def step(

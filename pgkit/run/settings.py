@@ -118,7 +118,10 @@ def _env_keywords(argv: Sequence[str]) -> tuple[list[str], dict[str, Any]]:
             raise UserError(f"{word}: give a value, as in --env.continuous True")
         with contextlib.suppress(ValueError, SyntaxError):
             value = ast.literal_eval(value)
-        found[name.replace("-", "_")] = value
+        name = name.replace("-", "_")
+        if name in ("num_envs", "seed", "workers", "action_repeat"):
+            raise UserError(f"{word.partition('=')[0]}: the run gives that to the environment, {flag(name, value)}")
+        found[name] = value
     return rest, found
 
 

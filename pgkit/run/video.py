@@ -11,6 +11,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from pgkit import files
 from pgkit.envs.gym_list import Gymnasium
 from pgkit.envs.parallel import Parallel
 from pgkit.envs.vmas_batch import Vmas
@@ -93,7 +94,10 @@ def _with_codec(file: Path) -> Path:
             needs("imageio_ffmpeg", "video")
         except UserError as error:
             getLogger("pgkit").warning("MP4: %s; a GIF is written", error)
-            return file.with_suffix(".gif")
+            file = file.with_suffix(".gif")
+    with files.replacing(file.with_name(f"{file.name}.try")) as trial:
+        trial.write(b"")  # before the episodes are played
+    file.with_name(f"{file.name}.try").unlink()
     return file
 
 

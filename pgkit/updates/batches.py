@@ -99,7 +99,7 @@ class TorchRLBatches:
         return []
 
     def drawn(self) -> None:
-        if self.prioritized:
+        if self.prioritized and self._batch[self.priority].isfinite().all():
             self.buffer.update_tensordict_priority(self._sample.set(self.priority, self._batch[self.priority]))
 
     def settings(self) -> dict[str, Any]:

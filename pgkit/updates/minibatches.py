@@ -1,11 +1,35 @@
-"""The order of an update's minibatches, and the means of its metrics."""
+"""From a rollout to minibatches: rows or sequences, their order, and the means of the metrics."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor
+
+from pgkit.errors import UserError
+
+
+def as_rows(data: TensorDictBase, length: int | None) -> TensorDictBase:
+    """The rows that minibatches are drawn from: ``[rows]``, or sequences ``[rows, length]`` of successive steps.
+
+    Raises:
+        UserError: recurrent networks without a length, or a length that does not divide the rollout's steps.
+    """
+    if length is None:
+        if any(key == "recurrent_state" or key[-1] == "recurrent_state" for key in data.keys(True)):
+            raise UserError(
+                "the networks are recurrent, single rows do not train their memory: use OnPolicyUpdate with "
+                "sequence_length= (16, say)"
+            )
+        return data.reshape(-1).contiguous()
+    if data.batch_size[-1] % length:
+        raise UserError(
+            f"sequence_length={length} does not divide the {data.batch_size[-1]} steps that each environment takes for "
+            "a rollout: change one of them"
+        )
+    return data.reshape(-1, length).contiguous()
 
 
 def minibatches(
@@ -21,6 +45,11 @@ def minibatches(
 
 
 def means(names: Sequence[str], results: Sequence[Tensor]) -> dict[str, float]:
-    """The metrics of several steps, averaged, off the device at once."""
-    mean = torch.stack(tuple(results)).mean(0) if len(results) > 1 else results[0]
-    return dict(zip(names, mean.tolist(), strict=True))
+    """The metrics of several steps, averaged, off the device at once.
+
+    Skipped steps, of which the last metric is 1, are left out, but for that metric; unless all were.
+    """
+    every = torch.stack(tuple(results))
+    taken = every[every[:, -1] == 0]
+    mean = (taken if len(taken) else every).mean(0).tolist()
+    return dict(zip(names, [*mean[:-1], every[:, -1].mean().item()], strict=True))

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from pgkit import optim
-from pgkit.checks import LossView, assembly, check_settings, diagram, is_loss
+from pgkit.checks import LossView, assembly, check_settings, diagram, is_loss, result_of
 from pgkit.compiled import check_compile, choose, undone
 from pgkit.data import ReplayBuffer
 from pgkit.errors import UserError
@@ -21,7 +22,7 @@ from pgkit.updates.batches import Batches, batches_of
 from pgkit.updates.interrupts import interruptible
 from pgkit.updates.minibatches import means
 from pgkit.updates.state import load, save
-from pgkit.updates.step import GradientStep, Grads, grads_of, metrics_of
+from pgkit.updates.step import GradientStep, Grads, grads_of, metrics_of, norm_of
 from pgkit.updates.targets import averaging, copying
 
 
@@ -185,7 +186,8 @@ class OffPolicyUpdate:
 
     def _assemble(self, data: TensorDictBase, index: Tensor) -> Plan:
         batch = self._batches.gather(data, index)
-        names = assembly(self._view, self.optimizer, batch, owners_of_gamma=self._batches.settings())
+        look = partial(assembly, self._view, self.optimizer, batch, owners_of_gamma=self._batches.settings())
+        names = undone(self.loss.buffers(), look)
         every = self._gradient_step(names, None, average=True)
         if self.actor_delay == 1:
             return Plan(every, every, batch)
@@ -202,21 +204,24 @@ class OffPolicyUpdate:
             kept = {id(p) for reached in only.values() for p in reached}
             params = [p for p in params if id(p) in kept]
 
-        def gradients(data: TensorDictBase, index: Tensor) -> tuple[Tensor, Grads]:
+        def gradients(data: TensorDictBase, index: Tensor) -> tuple[list[Tensor], Grads]:
             batch = self._batches.gather(data, index)
             if self.augment is not None:
                 batch = self.augment(batch)
-            out = self.loss(batch)
-            with torch.no_grad():
-                self._batches.write_back(data, index, batch)
+            out = result_of(self.loss, batch)
             grads = grads_of(out, params, only)
+            with torch.no_grad():
+                self._batches.write_back(data, index, _usable(batch, self._batches.priority, grads))
             return metrics_of(out, names, like=grads[0]), grads
 
-        def after() -> None:
+        def after(finite: Tensor) -> None:
             if self.project is not None:
+                before = [p.clone() for p in params]
                 self.project(params)
+                for p, old in zip(params, before, strict=True):
+                    p.copy_(torch.where(finite, p, old))
             if average and self._average is not None:
-                self._average()
+                self._average(finite)
 
         steps = None if self.total_frames is None else self.total_frames * self.updates_per_step
         return GradientStep(
@@ -239,7 +244,7 @@ class OffPolicyUpdate:
         params = optim.parameters(self.optimizer)
 
         def trial() -> dict[str, list[Tensor]]:
-            out, reached = self.loss(batch.copy()), {}
+            out, reached = result_of(self.loss, batch.copy()), {}
             for key in [key for key in out.keys() if is_loss(key) and out[key].requires_grad]:
                 grads = torch.autograd.grad(out[key].sum(), params, allow_unused=True, retain_graph=True)
                 reached[key] = [p for p, grad in zip(params, grads, strict=True) if grad is not None]
@@ -252,6 +257,13 @@ class OffPolicyUpdate:
         if not reached:
             raise UserError(f"actor_delay needs a critics' loss (loss_qvalue), {self._view.name} has none")
         return reached
+
+
+def _usable(batch: TensorDictBase, priority: NestedKey, grads: Grads) -> TensorDictBase:
+    """The batch; where the gradient is not finite, its errors are NaN, which leave the priorities as they are."""
+    if (errors := batch.get(priority, None)) is None:
+        return batch
+    return batch.copy().set(priority, torch.where(norm_of(grads).isfinite(), errors, torch.nan))
 
 
 def _averaged(results: Mapping[GradientStep, Sequence[Tensor]]) -> dict[str, float]:

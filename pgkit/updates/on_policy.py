@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, cast
 
 import torch
@@ -12,16 +13,15 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from pgkit.checks import LossView, assembly, check_settings, diagram
-from pgkit.compiled import Compiled, Mode, check_compile, choose, compiled
+from pgkit.checks import LossView, assembly, check_settings, diagram, result_of
+from pgkit.compiled import Compiled, Mode, check_compile, choose, compiled, undone
 from pgkit.errors import UserError
 from pgkit.functional import standardize
 from pgkit.optim import parameters
 from pgkit.seams import Augmentation
 from pgkit.updates.interrupts import interruptible
 from pgkit.updates.learners import Alone, Learners
-from pgkit.updates.minibatches import means, minibatches
-from pgkit.updates.sequences import as_rows
+from pgkit.updates.minibatches import as_rows, means, minibatches
 from pgkit.updates.state import load, save
 from pgkit.updates.step import GradientStep, Grads, grads_of, metrics_of
 
@@ -185,7 +185,8 @@ class OnPolicyUpdate:
         keys = view.readable(estimated)
         flat = as_rows(estimated.select(*keys), self.sequence_length)
         batch = flat[: self._size(flat)]
-        names = assembly(view, self.optimizer, batch, rollout=rollout, resumed=self.frames > 0)
+        look = partial(assembly, view, self.optimizer, batch, rollout=rollout, resumed=self.frames > 0)
+        names = undone(self.loss.buffers(), look)
         anchors = [key for key in (*view.keys("value"), *view.keys("sample_log_prob")) if key in keys]
         step = self._gradient_step(
             names, rollout.numel() * self.learners.size, self.epochs * -(-len(flat) // len(batch))
@@ -196,13 +197,13 @@ class OnPolicyUpdate:
         """One step on a minibatch, of so many steps for so many frames."""
         params, key = parameters(self.optimizer), self._view.key("advantage") or "advantage"
 
-        def gradients(data: TensorDictBase, index: Tensor) -> tuple[Tensor, Grads]:
+        def gradients(data: TensorDictBase, index: Tensor) -> tuple[list[Tensor], Grads]:
             batch = cast(TensorDictBase, data[index])
             if self.augment is not None:
                 batch = self.augment(batch)
             if self.normalize_advantage:
                 batch = batch.copy().set(key, standardize(batch[key]))
-            out = self.loss(batch)
+            out = result_of(self.loss, batch)
             grads = grads_of(out, params)
             return metrics_of(out, names, like=grads[0]), grads
 
@@ -261,14 +262,9 @@ class CompiledAdvantage:
 
         self.block = block
         self.native = compiled(
-            entries,
-            {"the advantage block": block},
-            others,
-            mode,
-            name="the advantage block",
-            agree=agree,
-            most=300,
-        )
+            entries, {"the advantage block": block}, others, mode, name="the advantage block", agree=agree, most=300,
+            but={"training"},
+        )  # fmt: skip
 
     def __call__(self, rollout: TensorDictBase) -> TensorDictBase:
         for key, x in zip(self.block.out_keys, self.native.bind(rollout)(), strict=True):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
-from functools import partial
+from functools import partial, reduce
 from typing import Any, cast
 
 import torch
@@ -13,11 +13,11 @@ from torch.optim import Optimizer
 
 from pgkit import optim
 from pgkit.checks import is_loss
-from pgkit.compiled import Mode, compiled
+from pgkit.compiled import Mode, compiled, tensors_of, undone, written_by
 from pgkit.errors import UserError
 
-Gradients = Callable[[TensorDictBase, Tensor], tuple[Tensor, list[Tensor]]]
 Grads = list[Tensor]
+Gradients = Callable[[TensorDictBase, Tensor], tuple[list[Tensor], Grads]]
 
 
 def grads_of(out: TensorDictBase, params: Sequence[Tensor], only: Container[str] | None = None) -> Grads:
@@ -27,9 +27,14 @@ def grads_of(out: TensorDictBase, params: Sequence[Tensor], only: Container[str]
     return list(torch.autograd.grad(total, params, allow_unused=True, materialize_grads=True))
 
 
-def metrics_of(out: TensorDictBase, names: Iterable[str], like: Tensor) -> Tensor:
-    """The entries of a loss's result that are reported ``[len(names)]``, in the type of ``like``."""
-    return torch.stack([out[name].detach().to(like.dtype).mean() for name in names])
+def metrics_of(out: TensorDictBase, names: Iterable[str], like: Tensor) -> list[Tensor]:
+    """The entries of a loss's result that are reported, one number each, in the type of ``like``."""
+    return [out[name].detach().to(like.dtype).mean() for name in names]
+
+
+def norm_of(grads: Grads) -> Tensor:
+    """The norm of the gradient over all parameters."""
+    return reduce(torch.add, [grad.square().sum() for grad in grads]).sqrt()  # no stack: that is a tensor for each
 
 
 class GradientStep:
@@ -39,18 +44,22 @@ class GradientStep:
     are added up over minibatches, or that ``between`` changes, make two, and an optimizer without a rule steps by
     itself.
 
+    A step whose gradient is not finite changes nothing: not the parameters, the optimizer's state and the targets, nor
+    what the loss keeps in buffers. The metric ``skipped`` is 1 for such a step, 0 for every other.
+
     Args:
         gradients: ``(data, index) -> (metrics, grads)``: gathers the minibatch, runs the loss; one gradient for each of
             ``params``, as :func:`grads_of` makes them.
         optimizer: its parameters are the ones that are trained.
-        names: of the metrics; ``grad_norm`` is added to them.
+        names: of the metrics; ``grad_norm`` and ``skipped`` are added to them.
         params: the optimizer's parameters to step on; None: all.
         watch: modules that ``gradients`` uses, by name, as in :func:`pgkit.compiled.compiled`.
         holds: further tensors that change in place.
         max_grad_norm: bound of the gradient's norm over all parameters; None: no bound.
-        after: what follows the optimizer's step: the target networks move.
+        after: what follows the optimizer's step: weights are projected, target networks move. It is given a 0-dim bool;
+            where that is False, nothing may change.
         between: ``grads -> grads`` before the norm clip.
-        mean: ``[metrics, *grads] -> [metrics, *grads]`` before that: the mean over several learners.
+        mean: ``[*metrics, *grads] -> [*metrics, *grads]`` before that: the mean over several learners.
         agree: as in :func:`pgkit.compiled.compiled`.
         apart: keeps the two graphs apart, for a call on several minibatches.
         mode: as in :func:`pgkit.compiled.compiled`.
@@ -69,7 +78,7 @@ class GradientStep:
         watch: Mapping[str, Any],
         holds: Iterable[Tensor] = (),
         max_grad_norm: float | None = None,
-        after: Callable[[], None] | None = None,
+        after: Callable[[Tensor], None] | None = None,
         between: Callable[[Grads], Grads] | None = None,
         mean: Callable[[Sequence[Tensor]], list[Tensor]] | None = None,
         agree: Callable[[bool], bool] = bool,
@@ -78,37 +87,52 @@ class GradientStep:
     ) -> None:
         if max_grad_norm is not None and max_grad_norm <= 0:
             raise UserError(f"max_grad_norm={max_grad_norm} lets nothing be trained: give a bound above 0, or None")
-        self.optimizer, self.names = optimizer, [*names, "grad_norm"]
+        self.optimizer, self.names = optimizer, [*names, "grad_norm", "skipped"]
         self.between, self.mean = between, mean
         self._params = optim.parameters(optimizer) if params is None else list(params)
+        self._gradients, self._watch, self._holds = gradients, watch, list(holds)
+        self._max_grad_norm, self._after = max_grad_norm, after
         self._rules = rules = None if mode == "off" else optim.bound(optimizer, self._params)
-        step = partial(optim.step, optimizer, self._params) if rules is None else rules.apply
         self._apart = apart or between is not None or mean is not None or rules is None
-
-        @torch.no_grad()
-        def apply(grads: Grads) -> Tensor:
-            norm = torch.stack([grad.square().sum() for grad in grads]).sum().sqrt()
-            if max_grad_norm is not None:
-                factor = optim.computed_once((max_grad_norm / (norm + 1e-6)).clamp(max=1.0))
-                grads = [grad * factor for grad in grads]
-            step(grads)
-            if after is not None:
-                after()
-            return norm
-
-        def first(data: TensorDictBase, index: Tensor) -> list[Tensor]:
-            metrics, grads = gradients(data, index)
-            return [metrics, *grads] if self._apart else [torch.cat([metrics, apply(grads)[None]])]
-
-        def second(_: None, *grads: Tensor) -> list[Tensor]:
-            return [apply(list(grads))]
-
-        held = [*self._params, *([] if rules is None else rules.tensors), *holds]
+        self._statistics: list[Tensor] | None = None  # buffers that the loss writes to as it runs
+        held = [*self._params, *([] if rules is None else rules.tensors), *self._holds]
         native = partial(compiled, watch=watch, holds=held, agree=agree)
         self.native = (
-            native(first, others=other_rows, mode=mode, name="the update"),
-            native(second, others=_other_gradients, mode="off" if rules is None else mode, name="the optimizer's step"),
+            native(self._first, others=other_rows, mode=mode, name="the update"),
+            native(self._second, others=_other_gradients, mode=mode if rules else "off", name="the optimizer's step"),
         )
+
+    def _first(self, data: TensorDictBase, index: Tensor) -> list[Tensor]:
+        """The whole step, or metrics and gradients of a minibatch."""
+        before = [] if self._apart else self._copies()
+        metrics, grads = self._gradients(data, index)
+        return [*metrics, *grads] if self._apart else [torch.stack([*metrics, *self._apply(grads, before)])]
+
+    def _second(self, _: None, *tensors: Tensor) -> list[Tensor]:
+        """The step with gradients, from statistics before them."""
+        grads = list(tensors[: len(self._params)])
+        return [*self._apply(grads, tensors[len(grads) :])]
+
+    @torch.no_grad()
+    def _apply(self, grads: Grads, before: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+        """Steps on the gradients, if they are finite; their norm, and 1 if they are not."""
+        norm = norm_of(grads)
+        finite = optim.computed_once(norm.isfinite())
+        if self._max_grad_norm is not None:
+            factor = optim.computed_once((self._max_grad_norm / (norm + 1e-6)).clamp(max=1.0))
+            grads = [grad * factor for grad in grads]
+        if self._rules is not None:
+            self._rules.apply(grads, finite)
+        elif finite:
+            optim.step(self.optimizer, self._params, grads)
+        for x, old in zip(self._statistics or (), before, strict=True):
+            x.copy_(torch.where(finite, x, old))
+        if self._after is not None:
+            self._after(finite)
+        return norm, (~finite).to(norm.dtype)
+
+    def _copies(self) -> list[Tensor]:
+        return [x.clone() for x in self._statistics or ()]
 
     def __call__(self, data: TensorDictBase, index: Tensor) -> Tensor:
         """One step on the rows ``index`` of ``data``; metrics ``[len(names)]``, still on the device."""
@@ -130,6 +154,9 @@ class GradientStep:
             )
         if self._rules is not None:
             self._rules.read()
+        if self._statistics is None:
+            trial = partial(written_by, tensors_of(self._watch), partial(self._gradients, data, index))
+            self._statistics = undone(self._holds, trial)
         first, size = self.native[0], len(index)
         call = first.bind(data, index)
 
@@ -140,12 +167,12 @@ class GradientStep:
 
     def _in_two(self, run: Callable[[Tensor], Sequence[Tensor]]) -> Callable[..., Tensor]:
         def call(*indices: Tensor) -> Tensor:
-            rows = sum(map(len, indices))
+            rows, before = sum(map(len, indices)), self._copies()
             results = _sum(map(run, indices), [len(index) / rows for index in indices])
-            metrics, *grads = results if self.mean is None else self.mean(results)
+            results = results if self.mean is None else self.mean(results)
+            metrics, grads = results[: -len(self._params)], results[-len(self._params) :]
             grads = grads if self.between is None else self.between(grads)
-            (norm,) = self.native[1].bind(None, *grads)(*grads)
-            return torch.cat([metrics, norm[None]])
+            return torch.stack([*metrics, *self.native[1].bind(None, *grads, *before)(*grads, *before)])
 
         return call
 
@@ -169,5 +196,6 @@ def other_rows(data: TensorDictBase, index: Tensor) -> Iterator[tuple[TensorDict
         yield cast(TensorDictBase, data.apply(lambda x, rows=rows: x.clone().copy_(x[rows]))) if batch else data, other
 
 
-def _other_gradients(_: None, *grads: Tensor) -> list[tuple[Any, ...]]:
-    return [(None, *(scale * grad for grad in grads)) for scale in (0.5, -3.0)]
+def _other_gradients(_: None, *tensors: Tensor) -> list[tuple[Any, ...]]:
+    scales = (0.5, -3.0, torch.inf)
+    return [(None, *((scale * x).to(x.dtype) for x in tensors)) for scale in scales]

@@ -26,10 +26,10 @@ def target_pairs(loss: nn.Module) -> Pairs:
     return {path: (t.view(1), s.view(1)) if path in scalar else (t, s) for path, (t, s) in apart.items()}
 
 
-def averaging(loss: nn.Module, tau: Tau) -> Callable[[], None] | None:
+def averaging(loss: nn.Module, tau: Tau) -> Callable[[Tensor], None] | None:
     r"""Moves the targets: :math:`\theta' \leftarrow \theta' + \tau (\theta - \theta')`; buffers are copied.
 
-    None for a loss without delayed parameters.
+    The function takes a 0-dim bool: where it is False, the targets stay. None for a loss without delayed parameters.
 
     Args:
         tau: :math:`\tau`, or its values by the names of networks and of modules in them: ``{"qvalue_network": 0.01,
@@ -41,9 +41,9 @@ def averaging(loss: nn.Module, tau: Tau) -> Callable[[], None] | None:
     moving, statistics = _trained_and_not(loss)
     rates = _rates(moving, tau)
 
-    def average() -> None:
+    def average(finite: Tensor) -> None:
         for path, (target, source) in moving.items():
-            target.lerp_(source.detach(), rates[path])
+            target.copy_(torch.where(finite, target.lerp(source.detach(), rates[path]), target))
         for target, source in statistics.values():
             target.copy_(source)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
@@ -12,12 +13,11 @@ from torch import Tensor, nn
 from torch.optim import SGD, Optimizer
 
 from pgkit.checks import LossView, assembly, check_settings, diagram
-from pgkit.compiled import check_compile, choose
+from pgkit.compiled import check_compile, choose, undone
 from pgkit.functional import conjugate_gradient
 from pgkit.optim import parameters
 from pgkit.updates.interrupts import interruptible
-from pgkit.updates.minibatches import means, minibatches
-from pgkit.updates.sequences import as_rows
+from pgkit.updates.minibatches import as_rows, means, minibatches
 from pgkit.updates.state import load, save
 from pgkit.updates.step import GradientStep, Grads, grads_of, metrics_of
 
@@ -47,9 +47,10 @@ class TrustRegionUpdate:
 
     :math:`F` is the Hessian of the mean :math:`KL(\pi_{old} \| \pi)` at :math:`\pi_{old}`, the Fisher matrix, of which
     only products with vectors are formed (a double backward pass); :math:`x` is from conjugate gradients. :math:`j` is
-    the least for which the loss falls and the KL is at most :math:`\delta`; if none up to ``backtracks`` is, the policy
-    stays. Schulman et al., 2015 (https://arxiv.org/abs/1502.05477, appendix C). Without the line search (:math:`j = 0`)
-    it is the natural policy gradient with a normalized step (Rajeswaran et al., 2017, https://arxiv.org/abs/1703.02660).
+    the least for which the loss falls and the KL is at most :math:`\delta`; if none up to ``backtracks`` is, or the
+    gradient is not finite, the policy stays. Schulman et al., 2015 (https://arxiv.org/abs/1502.05477, appendix C).
+    Without the line search (:math:`j = 0`) it is the natural policy gradient with a normalized step (Rajeswaran et al.,
+    2017, https://arxiv.org/abs/1703.02660).
 
     Args:
         loss: a loss with :meth:`~pgkit.losses.PolicyLoss.kl`, e.g. :class:`pgkit.losses.TRPOLoss`; the policy steps on
@@ -140,7 +141,8 @@ class TrustRegionUpdate:
             self._assign(start + size * full)
             with torch.no_grad():
                 improvement, kl = float(before - self._policy_loss(self.loss(batch))), float(self.loss.kl(batch).mean())
-            if not self.line_search or (improvement > 0 and kl <= self.max_kl):
+            better = improvement > 0 and kl <= self.max_kl
+            if better if self.line_search else full.isfinite().all():
                 result = {"kl": kl, "improvement": improvement, "step_size": size}
                 break
         else:
@@ -177,13 +179,14 @@ class TrustRegionUpdate:
         rows, critic = len(flat), [] if self.optimizer is None else parameters(self.optimizer)
         size = min(self.minibatch_size or rows, rows)
         every = SGD([*self._params, *critic], lr=0.0)  # who is trained, by the step or by the optimizer
-        names = assembly(self._view, every, flat[:size], rollout=rollout, resumed=self.frames > 0)
+        look = partial(assembly, self._view, every, flat[:size], rollout=rollout, resumed=self.frames > 0)
+        names = undone(self.loss.buffers(), look)
         own = [name for name in names if name not in (CRITIC, "explained_variance")]
         if self.optimizer is None:
             return Plan(own, None, flat[:size])
         rest = [name for name in names if name not in own]
 
-        def gradients(data: TensorDictBase, index: Tensor) -> tuple[Tensor, Grads]:
+        def gradients(data: TensorDictBase, index: Tensor) -> tuple[list[Tensor], Grads]:
             out = self.loss(data[index])
             grads = grads_of(out, critic, only=(CRITIC,))
             return metrics_of(out, rest, like=grads[0]), grads

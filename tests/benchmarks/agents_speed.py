@@ -76,7 +76,7 @@ def vmas_alone(steps: int) -> Callable[[], None]:
     """VMAS's own step with random actions, and its own reset of each environment that ended."""
     import vmas
 
-    env = vmas.make_env("balance", ENVS, seed=1, max_steps=100, n_agents=AGENTS)
+    env: Any = vmas.make_env("balance", ENVS, seed=1, max_steps=100, n_agents=AGENTS)
     env.reset()
     actions = [env.get_random_actions() for _ in range(steps)]
 

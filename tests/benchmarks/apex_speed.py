@@ -10,6 +10,8 @@ import argparse
 import time
 from statistics import median
 
+import cloudpickle
+import ray
 import torch
 
 from pgkit import collectors, data, updates
@@ -41,6 +43,7 @@ def main() -> None:
     flags = parser.parse_args()
     torch.set_num_threads(flags.threads)
     recipe = recipes.load(recipes.find("apex_sac"))
+    cloudpickle.register_pickle_by_value(recipe)
     args = recipe.Args(env_id=flags.env_id, explorers=flags.explorers, random_frames=0, total_frames=10**9)
     env = args.make_env(1, 1)
     collectors.connect(cpus=flags.explorers + args.shards)
@@ -54,7 +57,7 @@ def main() -> None:
         number, shard = replay.emptiest(1_000)
         entries = {key: x.contiguous().numpy() for key, x in rollout.items(True, True)}
         call = shard.extend.remote({"entries": entries, "batch": tuple(rollout.batch_size)}, 0)
-        replay.told(number, shard, 1_000, collectors.cluster.ray_module().get(call))
+        replay.told(number, shard, 1_000, ray.get(call))
 
     _, plain = learner(args, recipe, env, own)
     built, remote = learner(args, recipe, env, replay)

@@ -36,8 +36,9 @@ def make_rollout():
         return torch.randn(8, ROWS // 8, *size)
 
     flags = {key: torch.zeros(8, ROWS // 8, 1, dtype=torch.bool) for key in ("done", "terminated")}
-    following = {"observation": draw(17), "reward": draw(1), **flags}
-    data = {"observation": draw(17), "action": draw(6), "action_log_prob": draw() - 8, "next": following}
+    observation = draw(17)
+    following = {"observation": torch.cat([observation[:, 1:], draw(17)[:, :1]], 1), "reward": draw(1), **flags}
+    data = {"observation": observation, "action": draw(6), "action_log_prob": draw() - 8, "next": following}
     return TensorDict(data, (8, ROWS // 8))
 
 
@@ -72,11 +73,12 @@ def learner(rank, port, rounds):
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--rounds", type=int, default=10)
-    rounds = parser.parse_args().rounds
-    for threads in (1, 2):
+    parser.add_argument("--threads", type=int, nargs="*", default=[1, 2], help="of the one process; none: leave it out")
+    flags = parser.parse_args()
+    for threads in flags.threads:
         torch.set_num_threads(threads)
         for minibatch in (64, 4_096):
-            taken = times(make(minibatch), make_rollout(), rounds)
+            taken = times(make(minibatch), make_rollout(), flags.rounds)
             steps = ROWS // minibatch
             print(
                 f"one process, {threads} threads, {minibatch:5d} rows: {1e3 * taken / steps:6.2f} ms a step", flush=True
@@ -84,7 +86,7 @@ def main() -> None:
     with socket.socket() as s:
         s.bind(("127.0.0.1", 0))
         port = s.getsockname()[1]
-    mp.spawn(learner, (port, rounds), nprocs=2)
+    mp.spawn(learner, (port, flags.rounds), nprocs=2)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Collecting on Ray beside plain workers, TorchRL's Ray collector, and RLlib: frames per second.
 
     python tests/benchmarks/ray_speed.py workers   # HalfCheetah, as many plain workers as Ray actors, in turn
-    python tests/benchmarks/ray_speed.py slow      # an environment that sleeps 2 ms a step: 1, 8 and 16 actors
+    python tests/benchmarks/ray_speed.py slow      # an environment that sleeps 2 ms a step: --actors 1 8 16
     python tests/benchmarks/ray_speed.py torchrl   # TorchRL's collector with backend="ray", in turn with pgkit's
     python tests/benchmarks/ray_speed.py rllib     # RLlib's PPO (an environment of its own: pip install "ray[rllib]")
 
@@ -44,7 +44,7 @@ def collector(kind: Any, workers: int, env_id: Any = "HalfCheetah-v5", num_envs:
     torch.manual_seed(0)
     env = envs.make(env_id, num_envs=num_envs, seed=1, workers=workers)
     frames = num_envs * sizes.get("steps", STEPS)
-    return kind(env, modules.gaussian_actor(env, hidden=(64, 64)), frames_per_batch=frames, compile="on")
+    return kind(env, modules.gaussian_actor(env, hidden=(64, 64)), frames_per_batch=frames, compile="off")
 
 
 def speed(rollout: Callable[[], Any], frames: int) -> float:
@@ -70,8 +70,8 @@ def show(speeds: dict[str, float]) -> None:
         print(f"{name:<28} {value:>10,.0f} frames/s {value / first:>7.2f}", flush=True)
 
 
-def workers(turns: int) -> None:
-    for count in (1, 2):
+def workers(turns: int, actors: list[int]) -> None:
+    for count in actors:
         plain = collector(collectors.VectorCollector, count)
         spread = collector(collectors.RayCollector, count)
         named = {f"{count} plain workers": plain.rollout, f"{count} Ray actors": spread.rollout}
@@ -80,17 +80,17 @@ def workers(turns: int) -> None:
         spread.shutdown()
 
 
-def slow(turns: int) -> None:
+def slow(turns: int, actors: list[int]) -> None:
     speeds = {}
-    for count in (1, 8, 16):
+    for count in actors:
         spread = collector(collectors.RayCollector, count, Sleeps, num_envs=count)
         name = f"{count} actors, 2 ms a step"
         speeds |= in_turn({name: spread.rollout}, count * STEPS, max(turns // 4, 2))
         spread.shutdown()
-    show(speeds)
+    show(speeds)  # environments are as many as actors
 
 
-def torchrls(turns: int) -> None:
+def torchrls(turns: int, _: list[int]) -> None:
     connect(cpus=4)
     makers = [partial(envs.make, "HalfCheetah-v5", num_envs=ENVS // 2, seed=seed) for seed in (1, 2)]
     actor = modules.gaussian_actor(makers[0](), hidden=(64, 64))
@@ -99,7 +99,7 @@ def torchrls(turns: int) -> None:
     show(in_turn({"TorchRL, 2 actors": partial(next, theirs), "pgkit, 2 actors": ours.rollout}, ENVS * STEPS, turns))
 
 
-def rllib(turns: int) -> None:
+def rllib(turns: int, _: list[int]) -> None:
     """PPO's sampling alone: RLlib's own measure of it, at the same number of environments and the same network."""
     from ray.rllib.algorithms.ppo import PPOConfig  # pyright: ignore[reportMissingImports]
     from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig  # pyright: ignore
@@ -120,5 +120,6 @@ if __name__ == "__main__":
     parts = {"workers": workers, "slow": slow, "torchrl": torchrls, "rllib": rllib}
     parser.add_argument("part", choices=list(parts))
     parser.add_argument("--turns", type=int, default=20)
+    parser.add_argument("--actors", type=int, nargs="+")
     given = parser.parse_args()
-    parts[given.part](given.turns)
+    parts[given.part](given.turns, given.actors or {"slow": [1, 8, 16]}.get(given.part, [1, 2]))

@@ -27,8 +27,8 @@ def row(name: str) -> str:
     finally:
         logger.removeHandler(handler)
     cells = [name]
-    for part in ("advance", "renew"):
-        why = next((x for x in reasons if x.startswith(f"{part} of") and "not recorded" in x), None)
+    for part, words in (("advance", "the step of"), ("renew", "the resets of")):
+        why = next((x for x in reasons if x.startswith(words) and "not recorded" in x), None)
         why = why or next((x for x in reasons if "not recorded" in x), "")
         cells.append("yes" if part in recorded else why.partition("as it is: ")[2])
     return f"| {' | '.join(cells)} |"

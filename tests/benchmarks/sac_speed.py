@@ -139,7 +139,7 @@ def replay(threads: int, prioritized: bool) -> dict[str, float]:
     step = update._plan.every
     index = buffer.sample_index(BATCH)[0]
     batch = update._batches.gather(buffer.data, index)
-    loss, optimizer, names = update.loss, update.optimizer, step.names[:-1]
+    loss, optimizer, names = update.loss, update.optimizer, step.names[:-2]
     params = [p for group in optimizer.param_groups for p in group["params"]]
 
     def gradients(data: Any, _: Any) -> Any:
@@ -148,7 +148,7 @@ def replay(threads: int, prioritized: bool) -> dict[str, float]:
         return metrics_of(out, names, grads[0]), grads
 
     watch = {"the loss": loss}
-    bare = updates.GradientStep(gradients, optimizer, names, watch=watch, average=update._average, mode="on")
+    bare = updates.GradientStep(gradients, optimizer, names, watch=watch, after=update._average, mode="on")
     rows = torch.arange(BATCH)
     whole, alone = step.bind(buffer.data, index), bare.bind(batch, rows)
     times: dict[str, list[float]] = {"write": [], "draw": [], "step": [], "step without gather": []}

@@ -50,6 +50,11 @@ def test_a_rollout_in_order_passes():
     check_order(view_of("observation"), rollout_of(observation=(3,))[1])
 
 
+@pytest.mark.fault(
+    kind=34,
+    injected="rollouts that are shuffled, stitched, flattened, or have time first",
+    outcome="the first look names the step that does not begin where the one before led",
+)
 @pytest.mark.parametrize(
     ("wrong", "where"),
     [

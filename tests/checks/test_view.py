@@ -12,7 +12,7 @@ from pgkit import advantages, controllers, envs, losses, modules, updates
 from pgkit.checks import LossView, assembly, entries
 from pgkit.checks.broadcasts import BroadcastError, NoBroadcasts
 from pgkit.errors import UserError
-from pgkit.updates.sequences import as_rows
+from pgkit.updates.minibatches import as_rows
 from tests.updates.mistakes import Agent
 
 

@@ -116,6 +116,11 @@ def fail(capsys: pytest.CaptureFixture[str], *words: str) -> str:
     return error
 
 
+@pytest.mark.fault(
+    kind=29,
+    injected="`pgkit eval` of a run of a recipe file",
+    outcome="it runs that file only with `--trust`",
+)
 def test_eval_runs_a_recipe_file_only_where_it_is_trusted(inside: Path, capsys: pytest.CaptureFixture[str], caplog):
     words = ["eval", "r", "--episodes", "3", "--which", "latest"]
     assert f"r is a run of {inside / 'walk.py'}, which would be run: --trust" in fail(capsys, *words)
@@ -172,7 +177,7 @@ def test_flags_reach_the_recipe(inside: Path, capsys: pytest.CaptureFixture[str]
         (["cp", "ppo", "x" * 300 + ".py"], "cannot be written: File name too long"),
         (["plot", "r", "-o", "x" * 300 + ".png"], "File name too long"),
         (["eval", "x" * 300], "is not a run directory"),
-        (["run", "ppo", "--env-id", "MiniGrid-Empty-5x5-v0"], "registers it: PACKAGE:MiniGrid-Empty-5x5-v0"),
+        (["run", "ppo", "--env-id", "MiniGrid-Empty-5x5-v0"], "registers it: minigrid:MiniGrid-Empty-5x5-v0"),
         (["run", "walk.py", "--threads", "1e6"], "--threads 1000000: give at most 256"),
         (["run", "walk.py", "--num-envs", str(2**63)], "--num-envs 9223372036854775808: give at most 1e+06"),
         (["run", "walk.py", "--resume-if-possible"], "--resume-if-possible needs a --run-dir"),
@@ -301,6 +306,11 @@ def test_a_reader_that_goes_away_is_no_error(trained: Path):
     assert ls.returncode == 141
 
 
+@pytest.mark.fault(
+    kind=2,
+    injected="a recipe whose training diverges",
+    outcome="exit code 3, one line",
+)
 def test_a_diverged_run_exits_with_3(tmp_path: Path):
     (tmp_path / "walk.py").write_text(RECIPE.replace("log.step(frames)", "log.step(frames, None, {'x': float('nan')})"))
     done = pgkit("run", "walk.py", "--run-dir", "r", "--total-frames", "20", cwd=tmp_path)

@@ -65,7 +65,7 @@ def test_runs_with_other_flags_have_other_directories(tmp_path):
         (["--envs", "CartPole-v1", "--seeds", "x"], "--seeds x: give numbers and ranges"),
         (["--envs", "CartPole-v1", "CartPole-v1"], "environment CartPole-v1 is given twice"),
         (["--envs", "CartPole-v1", "--seed=3"], "--seed: the experiment sets it"),
-        (["--envs", "CartPole-v1", "--jobs", "0"], "--jobs 0"),
+        (["--envs", "CartPole-v1", "--jobs", "0"], "--jobs: 0 is not a positive number"),
     ],
 )
 def test_words_that_make_no_experiment(words, message, capsys):

@@ -61,7 +61,7 @@ def test_an_error_names_the_environment_its_step_and_its_seed(workers: int, deed
     with pytest.raises(EnvironmentFailed, match=r"^environment 1 \(Faulty\), " + message) as raised:
         collector.rollout()
     assert f"seed={episode_seed(3, 1, 1)}" in raised.value.line
-    assert "test_faults.py" in raised.value.frames and "pgkit/envs" not in raised.value.frames
+    assert "tests/faulty.py" in raised.value.frames and "pgkit/envs" not in raised.value.frames
     state, again = collector.state_dict(), make(workers=3 - workers)
     again.load_state_dict(state)
     assert state["frames"] == again.frames == 16
@@ -173,7 +173,7 @@ def test_a_worker_that_hangs_is_named_or_replaced(tmp_path: Path, caplog: Any):
 
 
 SLEEPER = """
-import os, sys, time
+import os, signal, time
 import gymnasium as gym
 import numpy as np
 from pgkit import collectors, envs, modules
@@ -190,6 +190,7 @@ class Sleeper(gym.Env):
             time.sleep(0.01)
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # which a shell's background jobs ignore
     env = envs.make(Sleeper, 2, workers=2)
     collectors.VectorCollector(env, modules.gaussian_actor(env), frames_per_batch=2, compile="off").rollout()
 """

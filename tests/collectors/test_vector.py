@@ -238,7 +238,7 @@ def counted():
     return Counting
 
 
-def test_a_policy_of_numpy_and_one_that_changes_its_mode_act_as_they_are():
+def test_a_policy_of_numpy_and_one_with_a_mode_act_in_evaluation_mode():
     class Scripted(nn.Module):
         def forward(self, obs):
             turned = np.where(obs.numpy() > 25, -1.0, 1.0)
@@ -246,13 +246,13 @@ def test_a_policy_of_numpy_and_one_that_changes_its_mode_act_as_they_are():
 
     actor = TensorDictModule(Scripted(), in_keys=["observation"], out_keys=["action"])
     collector = collectors.VectorCollector(envs.make(counted(), 2), actor, frames_per_batch=100, compile="off")
-    assert collector.rollout()["action"][0].unique().tolist() == [-1.0, 1.0]
+    assert collector.rollout()["action"][0].unique().tolist() == [-0.5, 0.5]
     net = nn.Sequential(nn.Linear(1, 1), nn.Dropout(0.5))
     dropout = TensorDictModule(net, ["observation"], ["action"])
     collector = collectors.VectorCollector(envs.make(counted(), 2), dropout, frames_per_batch=100, compile="off")
-    assert (collector.rollout()["action"] == 0).any()
-    dropout.eval()
-    assert (collector.rollout()["action"] != 0).any() and not (collector.rollout()["action"] == 0).any()
+    for mode in (True, False):
+        dropout.train(mode)
+        assert not (collector.rollout()["action"] == 0).any() and dropout.training == mode
     net[0] = nn.Linear(1, 1)
     nn.init.zeros_(net[0].weight)
     nn.init.constant_(net[0].bias, 7.0)

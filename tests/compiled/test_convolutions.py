@@ -34,7 +34,7 @@ def forward_and_backward(x, one, bias, two):
     with torch.enable_grad():
         hidden = F.conv2d(x, params[0], params[1], stride=2)
         out = F.conv2d(hidden, params[2], padding=1)
-        return [out.detach(), *torch.autograd.grad(out.sin().sum(), params)]
+        return [out.detach(), *torch.autograd.grad(out.square().sum(), params)]
 
 
 def halves(graph):

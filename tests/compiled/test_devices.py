@@ -28,6 +28,7 @@ def networks_elsewhere(monkeypatch):
 def bare_step(name, spoil=lambda batch: None):
     """Runs a step as it is recorded."""
     loss, data = make(name), batch(name).to("meta")
+    assert {x.device.type for x in (*loss.parameters(), *loss.buffers())} == {"meta"}, name
     optimizer = torch.optim.Adam([p for p in loss.parameters() if p.requires_grad])
     params = optimizer.param_groups[0]["params"]
     names = [key for key in loss.out_keys if key.startswith("loss_")]
@@ -43,7 +44,7 @@ def bare_step(name, spoil=lambda batch: None):
     with FakeTensorMode(allow_non_fake_inputs=True), torch.compiler._compile_session_context():
         index = torch.arange(8, device="meta")
         (metrics,) = step.native[0].function(data, index)
-    assert metrics.device.type == "meta" and metrics.shape == (len(names) + 1,)
+    assert metrics.device.type == "meta" and metrics.shape == (len(names) + 2,)
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)

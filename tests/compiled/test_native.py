@@ -35,5 +35,19 @@ def test_compiled_code_repeats_the_function(function, second):
     compiled = compile_record(record(function, inputs(0)), inputs(0))
     for seed in (0, 1):
         ours, its = inputs(seed), inputs(seed)
-        torch.testing.assert_close(list(compiled(*ours)), function(*its))
+        torch.testing.assert_close(list(compiled(list(ours))), function(*its))
         torch.testing.assert_close(ours, its)
+
+
+@pytest.mark.parametrize(("dtype", "rounding"), [(torch.float32, 2**-24), (torch.float64, 2**-53)])
+@torch.no_grad()
+def test_the_compiled_tanh_is_within_eight_roundings_everywhere(dtype, rounding):
+    """Near zero too, where a quotient of exponentials would lose all digits; and never beyond 1."""
+    sizes = torch.logspace(-30, 2, 10_000, dtype=dtype)
+    special = torch.tensor([0.0, torch.inf, -torch.inf, torch.nan], dtype=dtype)
+    x = torch.cat([sizes, -sizes, special])
+    (got,) = compile_record(record(lambda x: [x.tanh()], [x]), [x])([x])
+    expected = x.double().tanh()
+    ours = got.double()
+    assert torch.isnan(ours[-1]) and ours[-4] == 0
+    assert ((ours - expected).abs()[:-1] <= 8 * rounding * expected.abs()[:-1]).all() and ours[:-1].abs().max() <= 1

@@ -295,13 +295,23 @@ def test_a_replay_beyond_memory_is_refused_before_it_is_allocated():
         data.ReplayBuffer(envs.make("HalfCheetah-v5"), 10**12)
 
 
-@pytest.mark.parametrize("damage", ["cut", "empty", "no buffer", "text"])
+@pytest.mark.fault(
+    kind=14,
+    injected="a saved replay that is cut, empty, something else, or has one of 25 bits flipped",
+    outcome="one line; nothing of it is loaded",
+)
+@pytest.mark.parametrize("damage", ["cut", "empty", "no buffer", "text", "bits"])
 def test_damaged_files_are_one_line(tmp_path, damage):
     path, buffer = tmp_path / "buffer.pt", data.ReplayBuffer(envs.make("Pendulum-v1"), 50)
     buffer.save(path)
     content = path.read_bytes()
     if damage == "no buffer":
         torch.save({"made_for": buffer.state_dict()["made_for"]}, path)
+    elif damage == "bits":
+        for bit in torch.randint(8 * len(content), (25,), generator=torch.Generator().manual_seed(0)).tolist():
+            path.write_bytes(content[: bit // 8] + bytes([content[bit // 8] ^ 1 << bit % 8]) + content[bit // 8 + 1 :])
+            with pytest.raises(UserError, match="its hash does not fit"):
+                buffer.load(path)
     else:
         path.write_bytes({"cut": content[: len(content) // 2], "empty": b"", "text": b"hello"}[damage])
     with pytest.raises(UserError, match="is damaged|is no saved replay buffer") as error:

@@ -45,6 +45,10 @@ actor_of, gaussian, NONE = modules.categorical_actor, modules.gaussian_actor, No
 ROWS: dict[str, tuple[Row, str]] = {
     "observation: Box": ((BOX, CHOICE, actor_of, True, NONE), "as it is, in float32"),
     "observation: Box, image": ((DICT["picture"], CHOICE, actor_of, True, picture), "`encoder=`, which divides by 255"),
+    "observation: Box, matrix": (
+        (spaces.Box(-1, 1, (5, 5)), CHOICE, actor_of, True, NONE),
+        "flattened by the networks",
+    ),
     "observation: Discrete": ((spaces.Discrete(3), CHOICE, actor_of, True, NONE), "becomes one-hot"),
     "observation: MultiDiscrete": ((spaces.MultiDiscrete([2, 3]), CHOICE, actor_of, True, NONE), "one-hots, joined"),
     "observation: MultiBinary": ((spaces.MultiBinary(3), CHOICE, actor_of, True, NONE), "as it is"),
@@ -53,6 +57,10 @@ ROWS: dict[str, tuple[Row, str]] = {
     "observation: Dict, apart": (
         (DICT, CHOICE, actor_of, False, each_its_own),
         "`envs.make(..., flatten=False)`, `encoder=modules.dict_encoder({...})`",
+    ),
+    "observation: Dict with text": (
+        (spaces.Dict({"speed": BOX, "mission": spaces.Text(5)}), CHOICE, actor_of, True, NONE),
+        "what holds no numbers is left out, with a warning",
     ),
     "observation: Text": ((spaces.Text(5), CHOICE, actor_of, True, NONE), "becomes numbers of characters"),
     "observation: Sequence": ((spaces.Sequence(BOX), CHOICE, actor_of, True, NONE), "encode it in a wrapper"),

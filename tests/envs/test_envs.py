@@ -242,7 +242,7 @@ def test_keywords_and_a_time_limit_reach_a_class():
     [
         ("reset", r"Own.reset returned a ndarray: return the tuple \(observation, info\)"),
         ("step", "Own.step returned a tuple of 4: return the tuple .*truncated, info"),
-        ("obs", r"Own.step returned observation of shape \(1,\), its space says \(3,\)"),
+        ("obs", r"Own.step returned an observation .*: shape \(1,\), its space says \(3,\)"),
         ("reward", r"Own.step returned a reward of shape \(3,\): return one number"),
     ],
 )
@@ -345,7 +345,7 @@ def test_what_is_wrong_later_is_named_too(what):
         "None": r"Late.step returned an observation .* shape \(\), its space says \(3,\)",
         "flag": "Late.step returned terminated='False': return True or False",
         "reward": "Late.step returned a reward '5': return a number",
-        "reset": r"Late.reset returned observation of shape \(2,\), its space says \(3,\)",
+        "reset": r"Late.reset returned an observation .*: shape \(2,\), its space says \(3,\)",
     }[what]
     simulator.reset()
     with pytest.raises(UserError, match=message):

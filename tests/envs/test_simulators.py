@@ -249,7 +249,7 @@ def test_spaces_and_wrappers_that_do_not_fit_are_named(caplog):
 
     with pytest.raises(UserError, match="cannot become one vector"):
         envs.make(Spoken)
-    with pytest.raises(UserError, match="the observation space is a NoneType"):
+    with pytest.raises(UserError, match="Lacking.observation_space is missing, no gymnasium.spaces.Space"):
         envs.make(Lacking)
     envs.make(Steps)
     assert not caplog.text

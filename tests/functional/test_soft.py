@@ -11,11 +11,8 @@ from pgkit.controllers import FixedTemperature, Temperature
 column = lambda *x: torch.tensor(x, dtype=torch.float64).unsqueeze(-1)  # noqa: E731
 
 
-def test_soft_returns():
-    # rows: 2 - 0.5 * (-1) = 2.5, 3 + 0.5 = 3.5; -1 - 0.5 * 2 = -2, 4 - 1 = 3
+def test_values_of_several_critics():
     atoms = torch.tensor([[2.0, 3.0], [-1.0, 4.0]], dtype=torch.float64)
-    value = F.soft_returns(atoms, torch.tensor([-1.0, 2.0], dtype=torch.float64), 0.5)
-    assert value.tolist() == [[2.5, 3.5], [-2.0, 3.0]]
     assert F.twin_minimum(atoms).tolist() == [2.0, -1.0] and F.ensemble_mean(atoms).tolist() == [2.5, 1.5]
 
 
@@ -28,8 +25,6 @@ def test_target_bootstraps_unless_terminated():
 
 
 def test_shapes_and_dtypes_are_refused():
-    with pytest.raises(ValueError, match="nothing is broadcast"):
-        F.soft_returns(torch.zeros(4, 2), torch.zeros(4, 1), 1.0)
     with pytest.raises(ValueError, match="nothing is broadcast"):
         F.bootstrap_target(torch.zeros(4, 1), torch.zeros(4), torch.zeros(4, 1, dtype=torch.bool), 0.9)
     with pytest.raises(TypeError, match="boolean"):

@@ -123,7 +123,7 @@ def test_targets_of_every_part_move_also_where_two_have_one_name():
             p.add_(1.0)
     average = averaging(both, 1.0)
     assert average is not None
-    average()
+    average(torch.tensor(True))
     for part in soft:
         for name in ("actor_network", "qvalue_network") if part.delay_actor else ("qvalue_network",):
             pair: Any = part._modules[f"target_{name}_params"], part._modules[f"{name}_params"]

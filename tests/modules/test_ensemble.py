@@ -1,7 +1,7 @@
 """Blocks of critic ensembles: each member is a network of its own, statistics, dropout, members taken out."""
 
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import pytest
 import torch
@@ -69,8 +69,7 @@ def test_flash_is_batch_norm_linear_blocks_and_rms_norm():
         for p in layer.parameters():
             nn.init.normal_(p)
     x = torch.randn(2, 16, 5) * 2 + 1
-    parts: Any = layers
-    norm, first, block, last = parts
+    norm, first, block, last = cast(Any, layers)
 
     def normed(x, layer, k):
         return F.batch_norm(x, None, None, layer.weight[k, 0], layer.bias[k, 0], training=True)

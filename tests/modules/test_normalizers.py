@@ -76,6 +76,11 @@ def test_whole_numbers_are_taken_in():
     torch.testing.assert_close(normalizer.mean, torch.tensor([2.0, 10.0]))
 
 
+@pytest.mark.fault(
+    kind=3,
+    injected="one observation of ±1e6, 1e38 or infinity, in the first rollout or later",
+    outcome="mean and deviation stay within 5% of those without it",
+)
 @pytest.mark.parametrize("rollout", [0, 1, 20])
 @pytest.mark.parametrize("outlier", [1e6, -1e6, float("inf"), 1e38])
 def test_one_outlier_does_not_blind(rollout, outlier):

@@ -68,6 +68,11 @@ def test_discrete_actions_begin_where_the_space_does():
     assert set(actions.tolist()) <= {5, 6, 7} and policy.predict(np.zeros(2)) in Late.action_space
 
 
+@pytest.mark.fault(
+    kind=10,
+    injected="half-bounded, integer, float64 and binary actions",
+    outcome="`predict` gives what the environment gets in training, by one converter",
+)
 @pytest.mark.parametrize(
     "space",
     [

@@ -206,6 +206,11 @@ def test_a_run_without_a_checkpoint_cannot_be_resumed(kit: SimpleNamespace, tmp_
         kit.train(arguments(tmp_path / "r"))
 
 
+@pytest.mark.fault(
+    kind=2,
+    injected="a loss that becomes NaN",
+    outcome="one warning names it and the frames; the run ends with exit code 3",
+)
 def test_a_run_that_diverges_says_so_once(kit: SimpleNamespace, tmp_path: Path, caplog: pytest.LogCaptureFixture):
     def diverge() -> None:
         with run.Run(arguments(tmp_path / "r"), "walk") as log:
@@ -280,6 +285,11 @@ def test_a_kill_between_two_files_loses_no_best_policy(kit: SimpleNamespace, tmp
     assert saved == ["best.pt"]  # of the two, latest comes last: it says that there is a best
 
 
+@pytest.mark.fault(
+    kind=19,
+    injected="two processes that resume one run",
+    outcome="the second is refused in one line",
+)
 def test_two_processes_do_not_go_on_with_one_run(kit: SimpleNamespace, tmp_path: Path):
     kit.train(arguments(tmp_path / "r"))
     held = directory.lock(tmp_path / "r")
@@ -303,6 +313,11 @@ def test_a_run_that_ends_before_its_first_row_leaves_no_directory(kit: SimpleNam
         assert not (path / "config.json").exists()
 
 
+@pytest.mark.fault(
+    kind=32,
+    injected="`log.step(...)` in a loop of one's own",
+    outcome="it returns the row that it logged",
+)
 def test_a_step_returns_its_row_evaluation_included(kit: SimpleNamespace, tmp_path: Path):
     with run.Run(arguments(tmp_path / "r"), "walk") as log:
         log.track(policy=kit.policy(), eval_env=kit.Env)
@@ -367,6 +382,11 @@ def test_an_exit_from_within_is_no_success(kit: SimpleNamespace, tmp_path: Path)
     assert files.load(tmp_path / "r" / "checkpoints" / "latest.pt")["frames"] == 10
 
 
+@pytest.mark.fault(
+    kind=2,
+    injected="weights that are NaN or infinite when a checkpoint is due",
+    outcome="the checkpoints before stay; exit code 3",
+)
 def test_weights_that_are_not_finite_replace_no_checkpoint(kit: SimpleNamespace, tmp_path: Path):
     policy = kit.policy(1.0)
     with (

@@ -1,5 +1,6 @@
 """Files of a run directory: no code in them runs, damage is found, and nothing of anyone else's is touched."""
 
+import contextlib
 import errno
 import hashlib
 import io
@@ -10,6 +11,7 @@ import random
 import re
 import resource
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -85,6 +87,11 @@ def outcomes(kit: SimpleNamespace, path: Path, *which: int) -> list[str]:
     return said
 
 
+@pytest.mark.fault(
+    kind=13,
+    injected="a pickled bomb in place of any file of a run directory, also with a fitting hash",
+    outcome="no command runs it: resume, eval, init, load, plot",
+)
 def test_a_bomb_in_any_file_runs_in_no_command(kit: SimpleNamespace, trained: Path, tmp_path: Path):
     names = [path.relative_to(trained) for path in trained.rglob("*") if path.is_file()]
     assert {"config.json", "metrics.csv", "latest.pt", "best.pt", "summary.json"} <= {name.name for name in names}
@@ -102,6 +109,11 @@ def test_a_bomb_in_any_file_runs_in_no_command(kit: SimpleNamespace, trained: Pa
     assert crater.exists()  # the bomb is one
 
 
+@pytest.mark.fault(
+    kind=13,
+    injected="`config.json` names someone else's recipe file, module or wrapper",
+    outcome="nothing is imported without `--trust`; one line, exit code 2",
+)
 def test_code_that_a_config_names_is_not_run(kit: SimpleNamespace, trained: Path, tmp_path: Path, monkeypatch: Any):
     evil = tmp_path / "evil.py"
     evil.write_text(f"import os\nos.mkdir({str(tmp_path / 'crater')!r})\n")
@@ -125,6 +137,11 @@ def test_code_that_a_config_names_is_not_run(kit: SimpleNamespace, trained: Path
     assert not (tmp_path / "crater").exists()
 
 
+@pytest.mark.fault(
+    kind=14,
+    injected="60 single flipped bits in `latest.pt`",
+    outcome="each is found by the hash; the checkpoint that is whole is offered",
+)
 def test_every_flipped_bit_is_found_and_the_checkpoint_that_is_whole_is_offered(kit: SimpleNamespace, trained: Path):
     path = trained / "checkpoints" / "latest.pt"
     whole, draw = path.read_bytes(), random.Random(0)
@@ -139,6 +156,11 @@ def test_every_flipped_bit_is_found_and_the_checkpoint_that_is_whole_is_offered(
     assert run.load_policy(trained, "latest", agent=kit.agent).frames == 40
 
 
+@pytest.mark.fault(
+    kind=14,
+    injected="60 single flipped bits in `config.json` and in `metrics.csv`",
+    outcome="a resume finds each",
+)
 @pytest.mark.parametrize("name", ["config.json", "metrics.csv"])
 def test_a_flipped_bit_of_a_text_file_is_found_by_a_resume(kit: SimpleNamespace, trained: Path, name: str):
     path = trained / name
@@ -155,6 +177,11 @@ def test_a_flipped_bit_of_a_text_file_is_found_by_a_resume(kit: SimpleNamespace,
 WRONG = (None, 3, "x", [], {}, [[]], float("inf"), True)
 
 
+@pytest.mark.fault(
+    kind=14,
+    injected="every entry of `config.json`, `metrics.csv` and checkpoints as None, a number, a list, text",
+    outcome="one line, never a traceback",
+)
 def test_every_wrong_structure_is_one_line(kit: SimpleNamespace, trained: Path, monkeypatch: Any):
     monkeypatch.setattr(run.run, "evaluate", lambda *_: {"eval/mean_reward": 0.0, "eval/std_reward": 0.0})
     monkeypatch.setattr(run.run, "plot", lambda *_: None)
@@ -209,6 +236,11 @@ def test_files_come_back_as_they_were(tmp_path: Path):
     assert files.load(tmp_path / "x")["one"] == 0.1
 
 
+@pytest.mark.fault(
+    kind=17,
+    injected="links to another file under the names that are written",
+    outcome="the links are replaced; what they led to stays",
+)
 def test_a_planted_link_is_not_followed(trained: Path, tmp_path: Path):
     (tmp_path / "precious").write_text("mine")
     for name in ("x", ".x.part"):
@@ -218,6 +250,11 @@ def test_a_planted_link_is_not_followed(trained: Path, tmp_path: Path):
     assert not (tmp_path / "x").is_symlink() and not (tmp_path / ".x.part").exists()
 
 
+@pytest.mark.fault(
+    kind=16,
+    injected="a start that fails in a folder with other TensorBoard files and notes",
+    outcome="they stay; only what the run made goes",
+)
 def test_a_failed_start_deletes_its_own_files_alone(kit: SimpleNamespace, tmp_path: Path):
     others = ["events.out.tfevents.1.host.2.0", "notes.txt", ".latest.pt.part"]
     for name in others:
@@ -228,6 +265,11 @@ def test_a_failed_start_deletes_its_own_files_alone(kit: SimpleNamespace, tmp_pa
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(others)
 
 
+@pytest.mark.fault(
+    kind=18,
+    injected="a run that was killed before its first checkpoint",
+    outcome="the same command starts over; other settings are refused",
+)
 def test_a_run_killed_before_its_first_checkpoint_begins_again_by_the_same_command(
     kit: SimpleNamespace, trained: Path, tmp_path: Path
 ):
@@ -246,6 +288,11 @@ def test_a_run_killed_before_its_first_checkpoint_begins_again_by_the_same_comma
     assert [line.split(",")[0] for line in (trained / "metrics.csv").read_text().splitlines()] == ["frames", "10", "20"]
 
 
+@pytest.mark.fault(
+    kind=18,
+    injected="one command, started again and again with `--resume-if-possible`",
+    outcome="it begins, goes on, and ends with code 0 where nothing is left",
+)
 def test_one_command_goes_on_until_there_is_nothing_left(kit: SimpleNamespace, tmp_path: Path, capsys: Any):
     for total, frames in ((10, 10), (20, 20)):
         kit.train(arguments(kit, tmp_path / "r", total=total, resume_if_possible=True))
@@ -258,6 +305,11 @@ def test_one_command_goes_on_until_there_is_nothing_left(kit: SimpleNamespace, t
     )
 
 
+@pytest.mark.fault(
+    kind=19,
+    injected="a resume while another process still writes the checkpoint",
+    outcome="it is refused before it reads anything",
+)
 def test_a_resume_locks_before_it_reads(kit: SimpleNamespace, trained: Path):
     held = directory.lock(trained)
     (trained / "checkpoints" / "latest.pt").write_bytes(b"half of what the other process writes")
@@ -273,6 +325,11 @@ def full(*_: Any) -> None:
     raise OSError(errno.ENOSPC, "No space left on device")
 
 
+@pytest.mark.fault(
+    kind=20,
+    injected="a full disk for some checkpoints, and for all",
+    outcome="training goes on with a warning; the last one that fails is one line; no half file stays",
+)
 def test_a_full_disk_stops_no_training_and_leaves_no_half_file(
     kit: SimpleNamespace, tmp_path: Path, monkeypatch: Any, caplog: Any
 ):
@@ -304,6 +361,11 @@ def test_a_write_that_fails_amid_a_file_leaves_the_old_one(tmp_path: Path):
     assert files.load(tmp_path / "x") == {"a": 1} and [path.name for path in tmp_path.iterdir()] == ["x"]
 
 
+@pytest.mark.fault(
+    kind=20,
+    injected="a run directory that is deleted under way",
+    outcome="it is said at once; training goes on, and the end is one line",
+)
 def test_a_directory_that_goes_away_is_said_at_once_and_ends_the_run(kit: SimpleNamespace, tmp_path: Path, caplog: Any):
     def remove(frames: int) -> None:
         if frames == 10:
@@ -314,6 +376,11 @@ def test_a_directory_that_goes_away_is_said_at_once_and_ends_the_run(kit: Simple
     assert "metrics.csv cannot be written: No such file or directory; the training goes on" in caplog.text
 
 
+@pytest.mark.fault(
+    kind=15,
+    injected="a plain number of the actor that is annealed",
+    outcome="a loaded policy has its last value",
+)
 def test_what_is_evaluated_is_what_was_trained_annealed_numbers_included(kit: SimpleNamespace, tmp_path: Path):
     args = arguments(kit, tmp_path / "r")
     with run.Run(args, "walk") as log:
@@ -357,3 +424,30 @@ def test_an_agent_is_loaded_whole_and_trained_on(kit: SimpleNamespace, tmp_path:
         assert torch.equal(fresh.critic.weight, agent.critic.weight)
     with pytest.raises(UserError, match=r"state of agent does not fit .*it holds actor, critic; this agent has actor"):
         run.load_agent(tmp_path / "r", agent=kit.agent)
+
+
+@contextlib.contextmanager
+def limited(kind: int, most: int) -> Iterator[None]:
+    """What ``ulimit`` does to a process."""
+    soft, hard = resource.getrlimit(kind)
+    resource.setrlimit(kind, (most, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(kind, (soft, hard))
+
+
+@pytest.mark.fault(
+    kind=20,
+    injected="`ulimit -f`: files of 2 kB at most, and none at all; a file where the run directory's parent should be",
+    outcome="one line that says what cannot be written and why; no half file stays",
+)
+def test_limits_of_the_system_are_one_line(kit: SimpleNamespace, tmp_path: Path):
+    for most in (2000, 0):
+        with limited(resource.RLIMIT_FSIZE, most), pytest.raises(UserError, match="cannot be written: File too large"):
+            kit.train(arguments(kit, tmp_path / str(most)))
+        assert not [path for path in tmp_path.rglob("*") if path.name.endswith(".part")]
+    (tmp_path / "file").write_text("")
+    for path in (tmp_path / "file" / "r", tmp_path / "file"):
+        with pytest.raises(UserError, match="file"):
+            kit.train(arguments(kit, path))

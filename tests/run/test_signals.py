@@ -114,7 +114,7 @@ def test_kills_at_random_moments_cost_no_bit(nursery: Nursery, tmp_path: Path, r
         folder, code = tmp_path / str(number), 1
         while code != 0:
             pid = nursery.start(recipe, command(argv), folder)
-            time.sleep(draw.uniform(0, life))
+            time.sleep(draw.uniform(0, 0.6 * life))
             with contextlib.suppress(ProcessLookupError):
                 if kills < 20:
                     os.killpg(pid, signal.SIGKILL)
@@ -141,7 +141,7 @@ def test_signals_at_random_moments_lose_nothing(nursery: Nursery, tmp_path: Path
         folder, code = tmp_path / str(number), 1
         while code != 0:
             pid, signal_ = nursery.start("ppo", argv, folder), draw.choice(STOPS)
-            time.sleep(draw.uniform(0, life))
+            time.sleep(draw.uniform(0, 0.6 * life))
             with contextlib.suppress(ProcessLookupError):
                 for _ in range(0 if not count else 1 if signal_ == signal.SIGINT else 2):  # `timeout` sends two
                     os.killpg(pid, signal_)

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from pgkit.cli.main import main
+from pgkit.compiled import products
 from pgkit.run import run, threads
 from tests.recipes.test_ppo import pgkit
 
@@ -34,13 +35,17 @@ def test_one_core_is_one_thread_and_torchs_threads_stay(monkeypatch):
     assert threads.fastest_threads(lambda count: 1 / count) == 1
 
 
-def test_a_run_keeps_what_was_measured(monkeypatch, tmp_path):
+def test_a_machine_is_measured_once_and_a_run_keeps_it(monkeypatch, tmp_path):
     flags = ["--env-id", "CartPole-v1", "--num-envs", 2, "--steps", 32, "--eval-episodes", 1, "--threads", 0]
+    monkeypatch.setattr(products, "_choices", {})
+    monkeypatch.setattr(products, "_file", lambda: tmp_path / "choices.json")
     monkeypatch.setattr(run, "fastest_threads", lambda: 1)
     pgkit("run", "a2c", *flags, "--total-frames", 64, "--run-dir", tmp_path / "run")
     assert json.loads((tmp_path / "run" / "config.json").read_text())["settings"]["threads"] == 1
     monkeypatch.setattr(run, "fastest_threads", lambda: pytest.fail("measured again"))
     pgkit("run", "a2c", "--resume", tmp_path / "run", "--total-frames", 128)
+    monkeypatch.setattr(products, "_choices", {})  # another process: the same seed gives the same numbers
+    pgkit("run", "a2c", *flags, "--total-frames", 64, "--run-dir", tmp_path / "again")
 
 
 def test_the_command_line_lets_waiting_threads_sleep_unless_told_otherwise(monkeypatch):

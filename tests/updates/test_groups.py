@@ -25,7 +25,7 @@ def test_agents_with_memories_are_trained_on_what_they_remembered(core: Any, sha
     memory = core(env, 8, (8,), share_parameters=share)
     actor, critic = modules.gaussian_actor(env, encoder=memory), modules.state_value(env, encoder=memory)
     with torch.no_grad():
-        actor.get_submodule("module.0.module.head").weight.mul_(300)  # so that a wrong memory shows
+        actor.get_submodule("module.0.module.head.mean").weight.mul_(300)  # so that a wrong memory shows
     loss = losses.ClipPPOLoss(actor, critic)
     update = updates.OnPolicyUpdate(
         loss, advantages.GAE(critic), torch.optim.SGD(loss.parameters(), lr=0.0), epochs=1, minibatch_size=32,
@@ -80,18 +80,18 @@ def test_a2c_trains_a_group():
 
 def off_policy(kind: str, env: Any) -> tuple[Any, Any]:
     torch.manual_seed(0)
-    critic = modules.q_value(env, (32,))
+    critic = modules.q_value(env, hidden=(32,))
     if kind == "sac":
         actor = explored = modules.tanh_normal_actor(env, (32,))
         loss = losses.SACLoss(actor, critic, alpha_init=0.01, gamma=0.5)
     else:
         actor = modules.deterministic_actor(env, (32,))
-        explored = modules.GaussianExploration(actor, env, sigma=0.3)
+        explored = modules.GaussianExploration(actor, env, std=0.3)
         loss = losses.TD3Loss(actor, critic, bounds=(-1.0, 1.0), gamma=0.5)
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(4_000), batch_size=64)  # pgkit's own has no groups
     update = updates.OffPolicyUpdate(
         loss, buffer, torch.optim.Adam([p for p in loss.parameters() if p.requires_grad], lr=3e-3), batch_size=64,
-        updates_per_step=0.5, compile="off",
+        updates_per_step=0.5, learning_starts=64, compile="off",
     )  # fmt: skip
     return explored, update
 
@@ -150,7 +150,8 @@ def test_a_policy_of_groups_predicts_on_plain_arrays():
     env = envs.make(Unlike, num_envs=2, seed=1)
     actors = modules.categorical_actor(env, (8,), group="speaker"), modules.gaussian_actor(env, (8,), group="listener")
     with torch.no_grad():
-        actors[1].get_submodule("module.0.module.head").weight.mul_(1e4)
+        for name, weight in actors[1].named_parameters():
+            weight.mul_(1e4 if "mean" in name else 1)
     both = Policy.of(TensorDictSequential(*actors), env)
     given: Any = {"speaker": {"observation": one[:1], "action_mask": [[False, False, True]]}, "listener": one[1:]}
     made = both.predict(given)

@@ -34,6 +34,7 @@ def test_an_interrupt_inside_a_loss_stays_one(off_policy: bool, first: bool):
     def interrupt(*_: Any) -> None:
         raise KeyboardInterrupt
 
+    assert network is not None
     network.register_forward_pre_hook(interrupt)
     with pytest.raises(KeyboardInterrupt):
         update(collector.rollout())
