@@ -76,6 +76,14 @@ PRESETS = {
     "HalfCheetah-*": dict(learning_rate=1e-3),
 }
 
+SEARCH = {
+    "learning_rate": (1e-4, 3e-3, "log"),
+    "tau": (0.002, 0.05, "log"),
+    "gamma": [0.98, 0.99, 0.995],
+    "n_step": (1, 5),
+    "priority_alpha": (0.3, 0.9),
+}
+
 
 def agent(args: Args, env: EnvBase) -> run.Agent:
     """Networks, temperature and loss."""

@@ -178,13 +178,9 @@ def main(args: Args) -> None:
         with run.placed(args):
             built = agent(args, env)
         random_frames = args.random_frames if args.random_frames < args.total_frames else args.batch_size
-        buffer = data.ReplayBuffer(
-            env,
-            args.buffer_size,
-            n_steps=args.n_step,
-            sampler=data.Prioritized() if args.replay == "prioritized" else None,
-            storage=data.in_files(args.buffer_dir) if args.buffer_dir else LazyTensorStorage,
-        )
+        sampler = data.Prioritized() if args.replay == "prioritized" else None
+        storage = data.in_files(args.buffer_dir) if args.buffer_dir else LazyTensorStorage
+        buffer = data.ReplayBuffer(env, args.buffer_size, n_steps=args.n_step, sampler=sampler, storage=storage)
         groups = [
             {"params": list(built.actor.parameters()), "lr": args.learning_rate},
             {"params": list(built.critic.parameters()), "lr": args.q_learning_rate},
@@ -203,14 +199,8 @@ def main(args: Args) -> None:
             compile=args.compile,
         )
         make_collector = collectors.AsyncCollector if args.overlap else collectors.VectorCollector
-        collector = make_collector(
-            env,
-            built.actor,
-            frames_per_batch=args.num_envs * args.steps,
-            total_frames=args.total_frames,
-            init_random_frames=random_frames,
-            compile=args.compile,
-        )
+        frames = {"frames_per_batch": args.num_envs * args.steps, "total_frames": args.total_frames}
+        collector = make_collector(env, built.actor, **frames, init_random_frames=random_frames, compile=args.compile)
 
         replay = data.BesideCheckpoint(buffer, log.dir / "checkpoints" / "buffer.pt", save=args.save_buffer)
         log.track(agent=built, eval_env=args.make_env, update=update, collector=collector, replay=replay)

@@ -123,9 +123,7 @@ def make(
     stack = (4 if atari else 1) if frame_stack is None else frame_stack
     clips = atari if reward_clipping is None else reward_clipping
     if isinstance(env_id, EnvBase | GymVectorEnv):
-        if workers > 1 or kwargs:
-            what = f"workers={workers}" if workers > 1 else f"{next(iter(kwargs))}=..."
-            raise UserError(f"{what} with an environment that is made already: give a function that makes one")
+        _refuse_more(workers, kwargs)
         images = (pixels, stack, fast_render, clips)
         rest = (max_episode_steps, *images, groups, compile, env_timeout, reseed, reset_options)
         given = Settings(device, action_repeat, flatten, info, *rest)
@@ -146,15 +144,13 @@ def make(
     elif isinstance(env_id, str) and pixels is not None:
         kwargs = rendered(env_id, pixels) | kwargs
     images = (None if atari else pixels, stack, fast_render, clips)
-    steps = None if limited else max_episode_steps
-    rest = (steps, *images, groups, compile, env_timeout, reseed, reset_options)
+    rest = (None if limited else max_episode_steps, *images, groups, compile, env_timeout, reseed, reset_options)
     settings = Settings(device, action_repeat, flatten, info, *rest)
     function = _function(env_id, kwargs)
     env = VectorEnv(partial(_limited, function, settings), num_envs, seed, workers)
     env.env_timeout, env.restart_workers = env_timeout, restart_workers
-    env.env_id = env_id if isinstance(env_id, str) else getattr(env_id, "__qualname__", type(env_id).__name__)
-    if action_repeat > 1:
-        env.env_id += f" (action repeat {action_repeat})"
+    name = env_id if isinstance(env_id, str) else getattr(env_id, "__qualname__", type(env_id).__name__)
+    env.env_id = name if action_repeat == 1 else f"{name} (action repeat {action_repeat})"
     if stack > 1:
         env.frame_stack = stack
     return env
@@ -172,6 +168,13 @@ def vector_of(env: Any) -> VectorEnv:
             f"pgkit plays what envs.make gives, a {type(env).__name__} is none of that: envs.make(id or function)"
         )
     return env if isinstance(env, VectorEnv) else make(env, seed=int(torch.randint(2**31, ())))
+
+
+def _refuse_more(workers: int, kwargs: dict[str, Any]) -> None:
+    """A UserError for settings that an environment which is made already cannot follow."""
+    if workers > 1 or kwargs:
+        what = f"workers={workers}" if workers > 1 else f"{next(iter(kwargs))}=..."
+        raise UserError(f"{what} with an environment that is made already: give a function that makes one")
 
 
 def _adopt(env: EnvBase | GymVectorEnv, num_envs: int | None, seed: int, settings: Settings) -> VectorEnv:

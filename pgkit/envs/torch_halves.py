@@ -20,7 +20,7 @@ class Halves:
     """``env.step_and_maybe_reset`` in two: the step, and the resets where an episode ended.
 
     Args:
-        env: the environment; it is reset and steps once, for the names of its entries.
+        env: the environment; it is seeded, reset and steps once, for the names of its entries.
 
     Raises:
         RuntimeError: it resets itself.
@@ -30,6 +30,7 @@ class Halves:
         if vars(env).get("_torchrl_native_autoreset"):
             raise RuntimeError("it resets itself")
         self.env = env
+        env.set_seed(0)
         done, fresh = env.step_and_maybe_reset(env.rand_action(env.reset()))
         self.next, self.fresh = _leaves(done.get("next")), _leaves(fresh)
         self.taken = [*self.fresh, *env.action_keys]

@@ -225,13 +225,18 @@ class PolicyLoss(Loss):
                 params=self.critic_network_params.detach(),
                 target_params=self.target_critic_network_params,
             )
-        advantage = batch.get(self.tensor_keys.advantage)
+        advantage = self.counted(batch.get(self.tensor_keys.advantage), batch)
         return standardize(advantage, self.mask(advantage, batch)) if self.normalize_advantage else advantage
 
     def mask(self, entry: Tensor, batch: TensorDictBase) -> Tensor | None:
         """Which elements of an entry ``[*B, 1]`` are no padding, in its shape; None if the batch has no mask."""
         found = [x for key in self._loss_mask_keys() if (x := batch.get(key, None)) is not None]
         return torch.stack([self._expand_loss_mask(x, entry) for x in found]).all(0) if found else None
+
+    def counted(self, entry: Tensor, batch: TensorDictBase) -> Tensor:
+        """An entry ``[*B, 1]`` with 0 in place of padding, which may be NaN: 0 times that is no gradient of 0."""
+        mask = self.mask(entry, batch)
+        return entry if mask is None else torch.where(mask, entry, 0.0)
 
     def _loss_mask_keys(self) -> tuple[NestedKey, ...]:
         return masks_of(super()._loss_mask_keys(), self.tensor_keys.action, self.loss_mask_key)
@@ -254,7 +259,7 @@ class PolicyLoss(Loss):
         """Writes the value loss as ``name``, and ``explained_variance``, unless there is no critic."""
         if self.critic_network is None:
             return
-        value, target = self.value(batch), batch[self.tensor_keys.value_target]
+        value, target = self.value(batch), self.counted(batch[self.tensor_keys.value_target], batch)
         if self.clip_value is None:
             error = value_loss(value, target, self.loss_critic_type)
         else:

@@ -13,6 +13,7 @@ import torch
 from torch import nn
 
 from pgkit.cli import recipes
+from pgkit.envs import vector_of
 from pgkit.errors import UserError
 from pgkit.run import checkpoint, seeding
 from pgkit.run.args import RunArgs
@@ -105,10 +106,11 @@ def rebuild(run_dir: Path, make: Callable[..., Agent] | None, trust: bool) -> tu
     check_imports(args, trust)
     env = args.make_env(num_envs=1, seed=args.seed)
     try:
-        played = read_config(run_dir).get("environment", env.env_id)
-        if played != env.env_id:
+        name = vector_of(env).env_id
+        played = read_config(run_dir).get("environment", name)
+        if played != name:
             raise UserError(
-                f"{run_dir} was evaluated on {played}, its settings give {env.env_id}: make that environment in its "
+                f"{run_dir} was evaluated on {played}, its settings give {name}: make that environment in its "
                 "recipe's Args.make_env, which every command calls"
             )
         with seeding.preserved_rng():

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torchrl.data import Bounded
 
+from pgkit.envs import vector_of
 from pgkit.envs.spaces import ToEnv
 from pgkit.errors import UserError
 from pgkit.run.args import RunArgs
@@ -166,7 +167,7 @@ def _converter(spec: Any) -> ToEnv:
 
 def describe_env(env: Any) -> dict[str, Any]:
     """What :class:`Policy` must know of an env: the observation's shape and type, and how actions become its own."""
-    spec, acted = env.observation_spec_unbatched, env.action_keys
+    spec, acted = env.observation_spec_unbatched, vector_of(env).action_keys
     shapes = {name: tuple(spec[name].shape) for name in spec.keys(True, True)}
     dtypes = {name: str(spec[name].dtype).removeprefix("torch.") for name in shapes}
     return {

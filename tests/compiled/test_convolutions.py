@@ -89,5 +89,5 @@ def test_a_real_measurement_is_made_once_and_kept(monkeypatch):
 def test_native_code_makes_them_so():
     graph = record(forward_and_backward, images())
     native = compile_record(graph, images())
-    for got, its in zip(native(*images()), forward_and_backward(*images()), strict=True):
+    for got, its in zip(native(images()), forward_and_backward(*images()), strict=True):
         assert 0 < (got - its).abs().max() <= 2e-2 * its.abs().max()

@@ -171,7 +171,7 @@ def test_compiled_it_gathers_the_same(env):
     code = compile_record(record(gathered, inputs), inputs)
     for index in buffer.sample_index(16, 3):
         expected = buffer.gather(1.0)(buffer.data, index)
-        for got, key in zip(code(*inputs[:-1], index), ("pixels", ("next", "pixels")), strict=True):
+        for got, key in zip(code([*inputs[:-1], index]), ("pixels", ("next", "pixels")), strict=True):
             assert torch.equal(got, expected[key])
 
 

@@ -133,8 +133,6 @@ def test_what_a_loss_has_no_use_for_is_refused():
         make("DiscreteSACLoss", head=heads.Quantiles(5))
     with pytest.raises(UserError, match="loss_function='l1' is for critics without a head"):
         make("TQCLoss", loss_function="l1")
-    with pytest.raises(TypeError, match="delay_qvalue"):
-        make("CrossQLoss", delay_qvalue=True)
     for name in ALGORITHMS:
         with pytest.raises(TypeError, match="unexpected keyword argument 'entropi_coeff'"):
             make(name, entropi_coeff=0.1)

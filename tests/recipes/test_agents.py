@@ -36,7 +36,8 @@ def same_path(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_an_agent_is_built_again_and_loaded(tmp_path: Path, name: str, settings: dict[str, Any]):
     recipe = recipes.load(recipes.find(name))
     env_id = "CartPole-v1" if name in DISCRETE else "InvertedPendulum-v5" if name in PIXELS else "Pendulum-v1"
-    args = recipe.Args(env_id=env_id, hidden=(8, 8), **settings)
+    sizes = {"actor_width": 8, "critic_width": 8} if name == "flash_sac" else {"hidden": (8, 8)}
+    args = recipe.Args(env_id=env_id, **sizes, **settings)
     env = args.make_env(num_envs=3, seed=1)
     trained, fresh = recipe.agent(args, env), recipe.agent(args, env)
     files.save(tmp_path / "agent", trained.state_dict())
