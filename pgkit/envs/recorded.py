@@ -237,7 +237,7 @@ def record(
     state = state_of([call for each in calls.values() for call in each], num_envs)
     for function in functions:
         name = function.__name__
-        with falls_back(f"{name} of {kind}", mode):
+        with falls_back(f"{_WORDS.get(name, name)} of {kind}", mode):
             found[name] = Recorded(
                 function, find, calls[name][:: len(calls[name]) // 5], state, mode, f"{name} of {kind}"
             )
