@@ -185,7 +185,7 @@ class Sleeper(gym.Env):
         return np.zeros(1, np.float32), {}
 
     def step(self, action):
-        print(os.getpid(), flush=True)
+        os.write(1, f"{os.getpid()}\\n".encode())  # at once: two processes print here
         while True:
             time.sleep(0.01)
 
@@ -218,12 +218,15 @@ def test_the_workers_end_with_their_parent(tmp_path: Path, number: signal.Signal
         [sys.executable, script], stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=settings
     ) as run:
         assert run.stdout
-        pids = [int(run.stdout.readline()) for _ in range(2)]
-        run.send_signal(number)
-        end = time.monotonic() + 30
-        while not all(map(gone, pids)) and time.monotonic() < end:
-            time.sleep(0.05)
-        assert all(map(gone, pids))
+        try:
+            pids = [int(run.stdout.readline()) for _ in range(2)]
+            run.send_signal(number)
+            end = time.monotonic() + 30
+            while not all(map(gone, pids)) and time.monotonic() < end:
+                time.sleep(0.05)
+            assert all(map(gone, pids))
+        finally:
+            run.kill()
         while list(temporary.iterdir()) and time.monotonic() < end:  # the last of them removes it
             time.sleep(0.05)
     assert not list(temporary.iterdir()) and set(os.listdir("/dev/shm")) <= shared
