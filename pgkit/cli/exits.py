@@ -28,16 +28,16 @@ def exits() -> Iterator[None]:
     except (UserError, Diverged) as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         sys.exit(2 if isinstance(error, UserError) else 3)
-    except OSError as error:
-        if error.errno != errno.ENAMETOOLONG:
-            raise
-        print(f"error: {error.filename}: the name is too long, give a shorter one", file=sys.stderr)
-        sys.exit(2)
     except KeyboardInterrupt:
         sys.exit(130)
     except BrokenPipeError:  # of `pgkit ... | head`; nothing more can be printed, at the interpreter's end neither
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         sys.exit(141)
+    except OSError as error:
+        if error.errno != errno.ENAMETOOLONG:
+            raise
+        print(f"error: {error.filename}: the name is too long, give a shorter one", file=sys.stderr)
+        sys.exit(2)
 
 
 def report(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
