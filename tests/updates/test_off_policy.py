@@ -525,7 +525,7 @@ def test_a_term_that_trains_the_critics_alone_is_not_delayed_with_the_actor():
 def test_projection_follows_the_optimizer_and_comes_before_the_targets():
     seen = []
     update, collector = agent(project=lambda params: seen.append(len(params)), updates_per_step=0.25, actor_delay=2)
-    update._average = lambda: seen.append("averaged")
+    update._average = lambda finite: seen.append("averaged")
     train(update, collector, rollouts=3)
     every, critics = len(update.optimizer.param_groups[0]["params"]), 2 * 2  # weight and bias of two layers
     assert update.updates == 16 and seen == [every, "averaged", critics, "averaged"] * 8
