@@ -11,6 +11,7 @@ from torchrl.objectives import DistributionalDQNLoss
 
 from pgkit import data, envs, losses, modules, updates
 from pgkit.checks import LossView, assembly
+from pgkit.compiled import undone
 from pgkit.errors import UserError
 from tests.updates.mistakes import MISTAKES, PAGE, Agent, ReplayAgent, message, page, section
 
@@ -44,7 +45,8 @@ def test_what_is_right_passes_and_leaves_no_trace():
     agent.loss.forward = counting
     state = torch.get_rng_state()
     batch = agent.advantage(agent.rollout).reshape(-1)[:32]
-    names = assembly(LossView(agent.loss, agent.advantage), torch.optim.Adam(agent.parameters), batch)
+    view, optimizer = LossView(agent.loss, agent.advantage), torch.optim.Adam(agent.parameters)
+    names = undone(agent.loss.buffers(), lambda: assembly(view, optimizer, batch))  # as updates do
     assert names[:2] == ["loss_objective", "loss_entropy"]
     assert len(seen) == 1 and agent.loss.calls == 0 and torch.equal(state, torch.get_rng_state())
 
