@@ -121,7 +121,7 @@ def test_masked_assignments_are_recorded_for_all_elements():
     x, u = torch.tensor([0.0, 0, 1, 2]), torch.tensor([1.0, 1, 3, 3])
     code = compile_record(record(lambda x, u: [assign(x, u)], [x, u]), [x, u])
     for inputs in ((x, u), (u, x), (torch.tensor([5.0, 0, 2, 1]), torch.tensor([3.0, 1, 0, 2]))):
-        torch.testing.assert_close(code(*inputs)[0], assign(*inputs))
+        torch.testing.assert_close(code([*inputs])[0], assign(*inputs))
 
 
 @pytest.mark.parametrize("where", [lambda mask: mask, lambda mask: (slice(None), mask.long()), lambda mask: (mask, 0)])
