@@ -5,9 +5,8 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
-import sys
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any, NoReturn
 
@@ -162,18 +161,3 @@ def _decode(x: Any) -> Any:
         items = [_decode(value) for value in x]
         return items if isinstance(x, list) else tuple(items)
     return x
-
-
-def shipped(function: Callable[..., Any]) -> bytes:
-    """A function for processes on other machines: with its whole module where that is no installed one."""
-    import cloudpickle
-
-    module = sys.modules[function.__module__]
-    own = module.__name__ != "__main__" and not module.__name__.startswith("pgkit.")
-    if not own:
-        return cloudpickle.dumps(function)
-    cloudpickle.register_pickle_by_value(module)
-    try:
-        return cloudpickle.dumps(function)
-    finally:
-        cloudpickle.unregister_pickle_by_value(module)

@@ -17,7 +17,7 @@ from pgkit.cli import recipes
 from pgkit.collectors import RayExplorers, connect
 from pgkit.data.ray_replay import _Shard
 from pgkit.errors import UserError
-from pgkit.files import shipped
+from pgkit.messages import shipped
 from tests.data.test_replay import hand_made
 from tests.recipes.test_ppo import pgkit, rows
 

@@ -9,7 +9,7 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 PGKIT = ROOT / "pgkit"
-FREE = {"torch", "tensordict", "errors", "seams", "files"}
+FREE = {"torch", "tensordict", "errors", "seams", "files", "messages"}
 MAY_IMPORT = {
     "functional": set(),
     "heads": {"functional"},

@@ -14,7 +14,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from pgkit.collectors.cluster import Waiting, ray_module
-from pgkit.files import shipped
+from pgkit.messages import packed, shipped
 
 Weights = Mapping[str, Tensor]
 Explore = Callable[[Weights], TensorDictBase]
@@ -185,9 +185,9 @@ class _Explorer:
         ray = ray_module()
         weights, updates = published
         rollout = self.explore({key: torch.tensor(x) for key, x in weights.items()})
-        entries = {key: x.contiguous().numpy() for key, x in rollout.items(True, True)}
+        message = packed(rollout)
         try:
-            stored = ray.get(shard.extend.remote({"entries": entries, "batch": tuple(rollout.batch_size)}, updates))
+            stored = ray.get(shard.extend.remote(message, updates))
         except ray.exceptions.RayActorError:
             stored = None
-        return {key: entries["next", key] for key in _EPISODES}, stored
+        return {key: message["entries"]["next", key] for key in _EPISODES}, stored

@@ -45,6 +45,7 @@ def record(function: Callable[..., Any], inputs: Sequence[Tensor]) -> GraphModul
     """
     with torch.compiler._compile_session_context(), _torchrl_told_so():
         graph = make_fx(function)(*inputs)
+        graph.graph.eliminate_dead_code()  # an unused log-probability; what writes in place or draws at random stays
     _mask_in_place(graph)
     return graph
 

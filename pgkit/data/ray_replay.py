@@ -14,7 +14,7 @@ from tensordict import TensorDict, TensorDictBase
 from pgkit.data.prioritized import Prioritized
 from pgkit.data.replay import ReplayBuffer
 from pgkit.errors import UserError, check_whole_number
-from pgkit.files import shipped
+from pgkit.messages import shipped, unpacked
 
 
 class Request(NamedTuple):
@@ -194,9 +194,7 @@ class _Shard:
         return self.buffer.capacity
 
     def extend(self, rollout: Mapping[str, Any], updates: int) -> tuple[int, float]:
-        data = TensorDict({}, batch_size=rollout["batch"])
-        for key, x in rollout["entries"].items():
-            data.set(key, torch.tensor(x))
+        data = unpacked(rollout)
         self.buffer.extend(data)
         written = torch.arange(max(self.buffer.written - data.numel(), 0), self.buffer.written)
         self.made_at[written % self.buffer.rows] = updates

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from pgkit.compiled import Mode, compiled, every_branch
-from pgkit.envs.vmas_state import Slot
+from pgkit.envs.held import Slot
 from pgkit.errors import UserError
 
 Function = Callable[..., Sequence[Tensor]]

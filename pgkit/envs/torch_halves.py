@@ -12,8 +12,8 @@ from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 
 from pgkit.compiled import Mode
+from pgkit.envs.held import Slot, walk
 from pgkit.envs.recorded import Function, Native, falls_back, record
-from pgkit.envs.vmas_state import Slot, walk
 
 
 class Halves:

@@ -16,11 +16,12 @@ from torchrl.data import Composite
 from pgkit.compiled import Mode
 from pgkit.envs.agents import Group, Names, groups_of, rewards, under
 from pgkit.envs.failures import FAILURES, fail, in_vector
+from pgkit.envs.held import Slot, put
 from pgkit.envs.numpy_entries import flags
 from pgkit.envs.recorded import Function, Native, Recorded, falls_back, record
 from pgkit.envs.seeding import episode_seed
 from pgkit.envs.spaces import to_env
-from pgkit.envs.vmas_state import Slot, Stream, make_function, put, slots
+from pgkit.envs.vmas_state import Stream, make_function, slots
 from pgkit.errors import UserError
 from pgkit.seams import Entries, Step
 

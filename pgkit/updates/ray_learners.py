@@ -7,9 +7,10 @@ from typing import Any
 
 import torch
 import torch.distributed as dist
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 
 from pgkit.errors import UserError
+from pgkit.messages import packed, unpacked
 from pgkit.updates.data_parallel import data_parallel
 from pgkit.updates.on_policy import OnPolicyUpdate
 
@@ -158,25 +159,16 @@ class _Learner:
     def train(self, share: dict[Any, Any], seed: int) -> dict[Any, Any]:
         torch.manual_seed(seed)
         device = next(self.update.loss.parameters()).device
-        made, batch = {key: torch.tensor(x, device=device) for key, x in share["entries"].items()}, share["batch"]
-        rollout = TensorDict({}, batch_size=batch)
-        for key, x in made.items():
-            rollout.set(key, x)
+        rollout = unpacked(share, device)
         try:
             self.update(rollout)
         except BaseException:
             dist.destroy_process_group()  # nobody waits for this one
             raise
-        return packed(rollout.exclude(*made))["entries"]
+        return packed(rollout.exclude(*share["entries"]))["entries"]
 
     def load(self, state: dict[str, Any]) -> None:
         self.update.load_state_dict(state)
-
-
-def packed(rollout: TensorDictBase) -> dict[str, Any]:
-    """A rollout as arrays, which Ray moves without a copy."""
-    entries = {key: x.contiguous().cpu().numpy() for key, x in rollout.items(True, True)}
-    return {"entries": entries, "batch": tuple(rollout.batch_size)}
 
 
 def _backend(gpus: int) -> str:

@@ -163,10 +163,10 @@ def torchrls(env: Any, centralized: bool, rollout: Any) -> Callable[[], Any]:
 def benchmarls(centralized: bool, minibatches: int) -> float:
     """CPU seconds of BenchMARL's gradient step, the median."""
     vars(torchrl.collectors).setdefault("SyncDataCollector", torchrl.collectors.Collector)
-    from benchmarl.algorithms import IppoConfig, MappoConfig
-    from benchmarl.environments import VmasTask
-    from benchmarl.experiment import Experiment, ExperimentConfig
-    from benchmarl.models.mlp import MlpConfig
+    from benchmarl.algorithms import IppoConfig, MappoConfig  # pyright: ignore[reportMissingImports]
+    from benchmarl.environments import VmasTask  # pyright: ignore[reportMissingImports]
+    from benchmarl.experiment import Experiment, ExperimentConfig  # pyright: ignore[reportMissingImports]
+    from benchmarl.models.mlp import MlpConfig  # pyright: ignore[reportMissingImports]
 
     config = ExperimentConfig.get_from_yaml()
     config.on_policy_collected_frames_per_batch, config.on_policy_n_envs_per_worker = 60_000, ENVS

@@ -51,3 +51,16 @@ def test_the_compiled_tanh_is_within_eight_roundings_everywhere(dtype, rounding)
     ours = got.double()
     assert torch.isnan(ours[-1]) and ours[-4] == 0
     assert ((ours - expected).abs()[:-1] <= 8 * rounding * expected.abs()[:-1]).all() and ours[:-1].abs().max() <= 1
+
+
+def test_a_record_leaves_out_what_nobody_uses_but_what_it_writes_or_draws():
+    def function(x):
+        x.sin().exp()
+        x.view(-1).add_(1)
+        noise = torch.rand(2)  # others draw what follows it
+        (noise + 1).sum()
+        return [x * 2]
+
+    graph = record(function, [torch.zeros(2, 2)])
+    called = [str(node.target) for node in graph.graph.nodes if node.op == "call_function"]
+    assert [name.split(".")[1] for name in called] == ["view", "add_", "rand", "mul"]
