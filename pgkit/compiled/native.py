@@ -15,15 +15,18 @@ from typing import Any, cast
 
 import torch
 from torch import Tensor
+from torch._guards import TracingContext, tracing
+from torch._subclasses import FakeTensorMode
 from torch.compiler import is_dynamo_compiling
 from torch.fx import GraphModule, Node, Proxy
 from torch.fx.experimental.proxy_tensor import make_fx
+from torch.fx.experimental.symbolic_shapes import ShapeEnv
 from torch.fx.proxy import GraphAppendingTracer
 from torch.fx.subgraph_rewriter import replace_pattern
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from pgkit.compiled.convolutions import halve_convolutions
-from pgkit.compiled.products import as_they_are, fastest_products
+from pgkit.compiled.products import as_they_are, cpu, fastest_products
 
 # the same random numbers as eager code
 _OPTIONS: dict[str, Any] = {
@@ -175,7 +178,10 @@ def compile_record(graph: GraphModule, inputs: Sequence[Tensor]) -> Callable[[li
         kernels.append((len(taken), compile_fx_inner(graph, taken, **kwargs)))
         return kernels[-1][1]
 
-    with torch.no_grad(), as_they_are():
+    # with a record of shapes, inductor keeps its code for later processes; its key lacks the CPU's instructions
+    shapes = TracingContext(FakeTensorMode(allow_non_fake_inputs=True, shape_env=ShapeEnv()))
+    kept = torch.compiler.config.patch(cache_key_tag=cpu())
+    with torch.no_grad(), as_they_are(), tracing(shapes), kept:
         code = compile_fx(graph, tensors, inner_compile=compile_kernels, config_patches=options)
     # around the kernels, aliases are taken apart: nothing to do where they take and give what the graph does
     if len(kernels) == 1:

@@ -1,7 +1,10 @@
 """A recorded and compiled function repeats the function, whatever its inputs and results share."""
 
+from uuid import uuid4
+
 import pytest
 import torch
+from torch._dynamo.utils import counters
 
 from pgkit.compiled.native import compile_record, record
 
@@ -64,3 +67,20 @@ def test_a_record_leaves_out_what_nobody_uses_but_what_it_writes_or_draws():
     graph = record(function, [torch.zeros(2, 2)])
     called = [str(node.target) for node in graph.graph.nodes if node.op == "call_function"]
     assert [name.split(".")[1] for name in called] == ["view", "add_", "rand", "mul"]
+
+
+def test_what_was_compiled_once_is_not_compiled_again(monkeypatch):
+    """Nor by a later process; but on a CPU with other instructions it is."""
+
+    def compiled():
+        inputs = [torch.ones(3, 3)]
+        code = compile_record(record(lambda x: [x.sin() + x.mm(WEIGHT[:, :3])], inputs), list(inputs))
+        torch.testing.assert_close(code(list(inputs))[0], inputs[0].sin() + inputs[0].mm(WEIGHT[:, :3]))
+        return counters["inductor"]["fxgraph_cache_hit"]
+
+    compiled()
+    hits = compiled()
+    assert compiled() == hits + 1
+    other = str(uuid4())
+    monkeypatch.setattr("pgkit.compiled.native.cpu", lambda: other)
+    assert compiled() == hits + 1 and compiled() == hits + 2
