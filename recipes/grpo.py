@@ -14,7 +14,7 @@ from typing import Any, Literal
 import torch
 from tensordict import TensorDict
 
-from pgkit import advantages, collectors, controllers, envs, losses, modules, run, updates
+from pgkit import advantages, collectors, envs, losses, modules, run, updates
 
 
 @dataclass
@@ -74,8 +74,8 @@ class Args(run.RunArgs):
     """Hugging Face folder or GGUF file in place of the transformer; --init takes such a folder too."""
     warm_start: float = run.setting(0.35, low=0, high=1)
     """Learn from the task's imperfect teacher until so many of the held-out prompts are solved; 0: not at all."""
-    warm_steps: int = run.setting(4_000, low=1)
-    """Supervised steps at most, of 64 answers each; their learning rate falls to 0."""
+    warm_steps: int = run.setting(2_000, low=1)
+    """Supervised steps at most, of 64 answers each; their learning rate rises for a twentieth of them, then falls."""
     teacher: Literal["imperfect", "perfect"] = "imperfect"
     """perfect: the warm start learns from correct solutions, for comparison."""
 
@@ -136,7 +136,7 @@ def agent(args: Args, env: envs.Prompts) -> run.Agent:
 def warm_start(args: Args, env: envs.Prompts, policy: modules.TokenPolicy) -> None:
     """Supervised learning from the task's teacher, until enough held-out prompts are solved."""
     test, random = args.prompt_env(500, args.seed, held_out=True), Random(args.seed)
-    optimizer = torch.optim.Adam(policy.parameters(), lr=3e-3, betas=(0.9, 0.95))
+    optimizer = torch.optim.Adam(policy.parameters(), lr=1.5e-3, betas=(0.9, 0.95))
     loss = losses.SFTLoss(policy.actor)
     update = updates.OnPolicyUpdate(
         loss,
@@ -145,7 +145,7 @@ def warm_start(args: Args, env: envs.Prompts, policy: modules.TokenPolicy) -> No
         epochs=1,
         minibatch_size=64,
         max_grad_norm=1.0,
-        schedules={"lr": controllers.linear(3e-3)},
+        schedules={"lr": lambda progress: 1.5e-3 * min(0.1 + 20 * progress, 1 - progress)},
         total_frames=64 * args.warm_steps,
         compile="off",
     )

@@ -68,6 +68,10 @@ class Transformer(nn.Module):
         self.embedding = nn.Embedding(vocab_size, width)
         nn.init.normal_(self.embedding.weight, std=0.1)
         self.blocks = nn.ModuleList(Block(width, heads) for _ in range(layers))
+        for name, weight in self.blocks.named_parameters():
+            if weight.dim() == 2:  # what is added to the sum begins smaller (Radford et al., 2019)
+                added = name.endswith(("out.weight", "down.weight"))
+                nn.init.normal_(weight, std=(weight.shape[1] * (2 * layers if added else 1)) ** -0.5)
         self.norm = nn.RMSNorm(width)
         size = width // heads
         base = max(100.0, 10.0 * context)  # the slowest rotation; slower ones would tell no two places here apart

@@ -26,9 +26,9 @@ from pgkit.errors import EnvironmentFailed
 ROOT = Path(__file__).resolve().parents[2]
 STOPS = [signal.SIGTERM, signal.SIGHUP, signal.SIGINT]
 SMALL = "--env-id tests.faulty:Faulty-v0 --num-envs 2 --hidden 8 --compile off --eval-episodes 1"
-PPO = shlex.split(f"{SMALL} --steps 16 --minibatch-size 16 --epochs 1 --total-frames 1024 --eval-every 128")
+PPO = shlex.split(f"{SMALL} --steps 16 --minibatch-size 16 --epochs 1 --total-frames 512 --eval-every 128")
 SAC = shlex.split(
-    f"{SMALL} --steps 2 --random-frames 16 --batch-size 8 --total-frames 192 --eval-every 32 --log-every 8 "
+    f"{SMALL} --steps 2 --random-frames 16 --batch-size 8 --total-frames 128 --eval-every 32 --log-every 8 "
     "--save-buffer"
 )
 

@@ -44,7 +44,8 @@ def test_a_branch_on_a_value_gets_a_graph_of_its_own():
     assert rung(compiled) == "recorded and compiled"
 
 
-def test_more_branches_than_graphs_run_as_they_are():
+def test_more_branches_than_graphs_run_as_they_are(monkeypatch):
+    monkeypatch.setattr("pgkit.compiled.recorded._MOST_GRAPHS", 1)
     taken = set()
 
     def surrogate(log_ratio, advantage):
@@ -52,8 +53,8 @@ def test_more_branches_than_graphs_run_as_they_are():
         taken.add(count)
         return (1 + 0.1 * count) * log_ratio.exp() * advantage
 
-    compiled = both(surrogate, rollouts(6))
-    assert len(taken) > 3
+    compiled = both(surrogate, rollouts(3))
+    assert len(taken) > 2
     assert rung(compiled) == "recorded and compiled"
 
 
