@@ -6,7 +6,7 @@ from typing import Any
 
 from griffe import Extension, Object
 
-MATH_BLOCK = re.compile(r"^( *)\.\. math::\n\n?((?:\1    .*\n?|\n)+)", re.MULTILINE)
+MATH_BLOCK = re.compile(r"^( *)\.\. math::(?: (.+\n(?:\1    .+\n)*)|\n\n?((?:\1    .*\n?|\n)+))", re.MULTILINE)
 MATH = re.compile(r":math:`([^`]*)`")
 REFERENCE = re.compile(r":\w+:`~?(?:[\w.]*\.)?(\w+)`")
 
@@ -23,5 +23,7 @@ class RestructuredText(Extension):
 
 
 def _block(match: re.Match[str]) -> str:
-    indent, body = match[1], " ".join(match[2].split())
+    indent, body = match[1], " ".join((match[2] or match[3]).split())
+    if "&=" in body:  # several lines, which Sphinx aligns by itself
+        body = rf"\begin{{split}} {body} \end{{split}}"
     return f"{indent}$$\n{indent}{body}\n{indent}$$\n\n"

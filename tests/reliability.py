@@ -12,24 +12,24 @@ PAGE = TESTS.parent / "docs" / "pages" / "reliability.md"
 PARTS = {"What an environment hands over": 12, "Files": 20, "Signals, processes, time": 26, "Command line": 32}
 PARTS |= {"Numbers": 34}  # up to which kind
 KINDS = {
-    1: "Shapes and types at every write", 2: "Values that are not finite, or not usable", 3: "Outliers",
+    1: "Shapes and types at every write", 2: "Values that are not finite, or too large", 3: "Outliers",
     4: "Arrays shared with user code", 5: "Seeds", 6: "`reset` options and `info`", 7: "Stateful wrappers",
     8: "Spaces", 9: "Bounds", 10: "Actions in training and in `predict`", 11: "Modules with a mode",
     12: "Endless episodes", 13: "No code in files", 14: "Damaged files", 15: "What is evaluated",
     16: "Deleting", 17: "Links", 18: "Young runs", 19: "Two processes, one directory",
-    20: "Full disks and the like", 21: "Signals", 22: "Exceptions", 23: "Hangs", 24: "Dead workers",
+    20: "Full disks and other limits", 21: "Signals", 22: "Exceptions", 23: "Hangs", 24: "Dead workers",
     25: "Second interrupts", 26: "Two runs side by side", 27: "The import path", 28: "Wrappers, ids and plugins",
     29: "Environments inside recipes", 30: "Memory", 31: "Absurd arguments and terminals", 32: "Logs and advice",
     33: "Infinities in the maths", 34: "Rows that are not successors",
 }  # fmt: skip
 HEAD = """# Reliability
 
-What is done to pgkit on purpose, and what it then does. Each row is a test of that name, which injects the fault and
-checks the outcome; `python tests/reliability.py` writes this page from them. `pytest -k NAME` runs one.
+How pgkit reacts to faults. Each row is a test that injects the fault and checks the outcome. `pytest -k NAME` runs one;
+`python tests/reliability.py` writes this page from the tests.
 
-Three answers are allowed. A mistake that one line can explain is a `UserError`: the command line prints that line and
-exits with code 2. A training that diverged exits with code 3. Everything else is repaired, and the numbers stay as they
-were.
+pgkit reacts in one of three ways. A mistake that one line can explain is a `UserError`: the command line prints that
+line and exits with code 2. A training that diverged exits with code 3. All other faults are repaired, and the numbers
+stay the same.
 """
 
 

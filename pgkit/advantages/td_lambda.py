@@ -15,9 +15,9 @@ from pgkit.functional import from_start, lambda_return, n_step_return
 
 
 class TDLambda(Advantage):
-    r"""The :math:`\lambda`-return as value target, and what it exceeds the value by as advantage.
+    r"""The :math:`\lambda`-return as value target; the advantage is the target minus the value.
 
-    The advantage is GAE's, by another road. Arguments as in :class:`~pgkit.advantages.Advantage`, and
+    The advantage equals GAE's. Arguments as in :class:`~pgkit.advantages.Advantage`, and
 
     Args:
         lmbda: weight of the long returns.
@@ -45,7 +45,7 @@ class TDLambda(Advantage):
 
 
 class NStep(Advantage):
-    """The n-step return as value target, and what it exceeds the value by as advantage.
+    """The n-step return as value target; the advantage is the target minus the value.
 
     Arguments as in :class:`~pgkit.advantages.Advantage`, and
 
@@ -75,8 +75,8 @@ class NStep(Advantage):
 class MonteCarlo(Advantage):
     """The sum of the rewards to come, minus the critic's value if there is a critic: REINFORCE's advantage.
 
-    What the rollout does not show, after its last step or a truncation, the critic's value stands for; without a
-    critic it counts as nothing, so make rollouts long, in time limits and in ``1 / (1 - gamma)``.
+    After the rollout's last step or a truncation, the critic's value stands for the rewards that are not seen. Without
+    a critic they count as zero, so make rollouts several time limits and several ``1 / (1 - gamma)`` long.
     Arguments as in :class:`~pgkit.advantages.Advantage`, and
 
     Args:

@@ -45,7 +45,7 @@ class AdaptiveKL(nn.Module):
 
 
 class FixedKL(nn.Module):
-    """A coefficient that stays.
+    """A constant coefficient.
 
     Args:
         beta: its value.

@@ -22,7 +22,7 @@ class Temperature(nn.Module):
             add the log of half the range of each dimension for others.
         alpha_init: its value at the start, above 0.
         min_alpha, max_alpha: bounds of :math:`\alpha`; None: none.
-        trained: False holds it still, as a buffer.
+        trained: False keeps it constant, as a buffer.
     """
 
     log_alpha: Tensor
@@ -61,7 +61,7 @@ class Temperature(nn.Module):
 
 
 class FixedTemperature(nn.Module):
-    """A temperature that stays: nothing to train, the loss is zero.
+    """A constant temperature: nothing to train, the loss is zero.
 
     Args:
         alpha: its value.

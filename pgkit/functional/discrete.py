@@ -31,7 +31,7 @@ def straight_through_sample(logits: Tensor, tau: float | Tensor = 1.0) -> Tensor
     r"""A one-hot draw from :math:`\text{softmax}(logits)` with the gradient of its relaxation.
 
     .. math:: y = \text{softmax}\big((logits + g) / \tau\big), \quad g_a \sim \text{Gumbel}(0, 1), \qquad
-              \text{onehot}(\arg\max y) + y - \text{stopgrad}(y)
+              \text{onehot}(\text{argmax} y) + y - \text{stopgrad}(y)
 
     Jang et al., 2017 (https://arxiv.org/abs/1611.01144): the forward pass is the draw itself, the backward pass that of
     :math:`y`, whose bias falls and whose variance rises as :math:`\tau \to 0`.

@@ -11,7 +11,7 @@ from pgkit.heads.returns import Returns
 
 @runtime_checkable
 class Head(Protocol):
-    """What ``size`` outputs of each critic stand for. It holds settings and no parameters."""
+    """The meaning of a critic's ``size`` outputs. It holds settings and no parameters."""
 
     size: int
 
@@ -20,11 +20,11 @@ class Head(Protocol):
         ...
 
     def returns(self, out: Tensor) -> Returns:
-        """What one critic says of the return: ``[*B, size] -> [*B]``."""
+        """The return that one critic predicts: ``[*B, size] -> [*B]``."""
         ...
 
     def least(self, out: Tensor) -> Returns:
-        """What several critics say of the return, with the least optimism: ``[*B, critics, size] -> [*B]``."""
+        """The cautious return of several critics: ``[*B, critics, size] -> [*B]``."""
         ...
 
     def loss(self, out: Tensor, target: Returns) -> Tensor:

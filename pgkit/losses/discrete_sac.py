@@ -35,9 +35,9 @@ class DiscreteSACLoss(SoftQLoss):
     action drawn from the policy, one-hot, with the gradient of its Gumbel-Softmax relaxation (Jang et al., 2017,
     https://arxiv.org/abs/1611.01144).
 
-    Defaults that differ from TorchRL's: the critics' loss is the squared error (there ``smooth_l1``), ``gamma`` is
-    given here, the number of actions is read off the batch where ``num_actions`` is not given, the importance
-    weights of a prioritized replay apply to the critics alone.
+    Four things differ from TorchRL's loss. The critics' loss is the squared error (there ``smooth_l1``). ``gamma`` is
+    given here. Without ``num_actions`` the batch gives the number of actions. The importance weights of a prioritized
+    replay apply to the critics alone.
 
     Args:
         actor_network: actor over discrete actions, e.g. :func:`pgkit.modules.categorical_actor`.

@@ -26,7 +26,7 @@ class REDQLoss(SoftQLoss):
 
     Args:
         actor_network: as in :class:`~pgkit.losses.SACLoss`.
-        qvalue_network: likewise; with a head its pool takes the minimum's place.
+        qvalue_network: likewise; a head's ``least`` takes the minimum's place.
         sub_sample_len: M.
         settings: those of :class:`~pgkit.losses.SoftQLoss`; ``num_qvalue_nets`` is N, 10 by default, where
             ``qvalue_network`` is one module, and ``actor_value`` is ``mean``.

@@ -72,11 +72,11 @@ def tanh_normal_actor(
     agent_ids: bool = False,
     device: torch.device | str | None = None,
 ) -> ProbabilisticActor:
-    """A Gaussian squashed by tanh into the action's bounds, mean and standard deviation both of the state (SAC's).
+    """SAC's Gaussian, squashed by tanh into the action's bounds; mean and standard deviation depend on the state.
 
-    Sample and log-probability come from one draw (TorchRL's ``rsample_and_log_prob``); a saturated action that is
-    scored again later gives a wrong number, so PPO wants ``tanh_loc=True``, which bounds the mean to [-5, 5] before
-    the tanh, together with ``log_std_bounds`` whose upper end is at most -1.
+    Sample and log-probability come from one draw (TorchRL's ``rsample_and_log_prob``), since a saturated action that is
+    scored again later gives a wrong number. PPO scores actions again: use ``tanh_loc=True``, which bounds the mean to
+    [-5, 5] before the tanh, and ``log_std_bounds`` whose upper end is at most -1.
 
     Args:
         env: any TorchRL environment with a bounded continuous action.

@@ -58,13 +58,13 @@ class ObsNormalizer(RunningMoments):
     For entries that vary from sample to sample and have no outliers, ``mean`` and ``std`` are those of all samples.
     Two rules keep the others useful:
 
-    - **Outliers.** A sample enters the moments as what the network sees of it: no further than ``clip`` deviations from
-      the mean. The first update has no deviation yet; it takes the batch's median, and as deviation the distance that
-      nine in ten samples keep, divided by 1.645 as for a Gaussian (1 where nine in ten are equal).
-    - **Entries that rest** at one value, the first batch's median, and leave it rarely: contact forces, flags. Where a
-      share :math:`p` below 1/4 leaves it, the deviation is the one that a quarter would have, so that the rare values
-      come out near 2 and not at :math:`1 / \sqrt p`: :math:`\sigma^2 = \text{var} \cdot \max(1, 1 / (4 p))`.
-      An entry that never left it is not scaled, :math:`\sigma = 1`.
+    - **Outliers.** A sample is clipped to ``clip`` deviations from the mean before it enters the moments. The first
+      update has no deviation yet. It takes the batch's median as mean and, as deviation, the distance that nine in ten
+      samples keep, divided by 1.645 as for a Gaussian (1 if nine in ten are equal).
+    - **Entries that rest** at one value, the first batch's median, and rarely leave it: contact forces, flags. If the
+      share :math:`p` of other values is below 1/4, :math:`\sigma^2 = \text{var} \cdot \max(1, 1 / (4 p))`. The rare
+      values then come out near 2 and not at :math:`1 / \sqrt p`. An entry that never left its value is not scaled,
+      :math:`\sigma = 1`.
 
     Args:
         env: an environment whose ``observation_spec`` has the entry ``observation``, or the shape itself.
@@ -127,8 +127,9 @@ class ReturnScale(RunningMoments):
     Give it to :class:`pgkit.advantages.GAE` (``return_scale=``): the critic's output is then in units of
     :attr:`scale`, the advantage stays in the rewards' unit. Call :meth:`update` once a rollout.
 
-    An outlier does not set the scale for good: a return enters as no further than ``clip`` deviations from the mean. In
-    the first update middle and deviation are the batch's median and typical distance, as in :class:`ObsNormalizer`.
+    One outlier does not spoil the scale: a return is clipped to ``clip`` deviations from the mean. In the first update
+    the batch's median and typical distance stand for mean and deviation, as in :class:`ObsNormalizer`. For a reward of
+    your own, such as an intrinsic one, use :class:`RewardScale`.
 
     Args:
         clip: far above the spread of rewards that are rare but real.
@@ -187,10 +188,10 @@ class RewardScale(nn.Module):
 
     .. math:: r \leftarrow \frac{r}{\max(\sigma_G, \max |G| / g_{max})}, \qquad G_t = r_t + \gamma\, G_{t-1}
 
-    with :math:`G` beginning anew with every episode, as in SimbaV2 (Lee et al., 2025, https://arxiv.org/abs/2502.15280)
-    and FlashSAC (https://arxiv.org/abs/2604.04539). A categorical critic can then have fixed bins. Rewards are stored
-    as they are and divided when they are drawn, by the scale of then: give it to
-    :class:`pgkit.updates.OffPolicyUpdate` (``augment=``), and call :meth:`update` once a rollout.
+    :math:`G` begins anew with every episode, as in SimbaV2 (Lee et al., 2025, https://arxiv.org/abs/2502.15280) and
+    FlashSAC (https://arxiv.org/abs/2604.04539). A categorical critic can then have fixed bins. Rewards are stored
+    unchanged; each batch divides them by the present scale. Give it to :class:`pgkit.updates.OffPolicyUpdate`
+    (``augment=``), and call :meth:`update` once a rollout.
 
     Args:
         num_envs: environments of a rollout.

@@ -24,7 +24,7 @@ Which = Literal["best", "latest"]
 
 @dataclass
 class Agent:
-    """What a recipe's ``agent(args, env)`` builds: networks, and what trains them except the optimizer.
+    """What a recipe's ``agent(args, env)`` builds: the networks and everything that trains them, but the optimizer.
 
     A run saves the parts that are modules.
 
@@ -34,8 +34,8 @@ class Agent:
         critic: the critics as a module, for the optimizer.
         advantage: the estimator of an on-policy update.
         explorer: the policy that collects, where it is not the actor.
-        normalizer: of observations; the recipe moves it.
-        scale: of returns; the recipe moves it.
+        normalizer: of observations; the recipe calls its ``update``.
+        scale: of returns; the recipe calls its ``update``.
         controller: a temperature, or the weight of a penalty.
     """
 

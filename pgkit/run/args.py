@@ -32,12 +32,12 @@ def setting(
     on_resume: bool | None = None,
     follows: str | None = None,
 ) -> Any:
-    """A field of a recipe's ``Args``. A class that overrides the default alone keeps the rest.
+    """A field of a recipe's ``Args``, with its bounds. A subclass that overrides only the default keeps them.
 
     Args:
-        low, high: least and largest value, of each number where there are several.
-        above: a bound that is no value itself.
-        on_resume: a resumed run may change it; it does not change what is learned.
+        low, high: least and largest value, of each number if there are several.
+        above: a lower bound that the value must exceed.
+        on_resume: a resumed run may change it, since it does not change what is learned.
         follows: the setting at which its schedule ends.
     """
     told = {"low": low, "high": high, "above": above, "on_resume": on_resume, "follows": follows}

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -166,10 +168,24 @@ def name(group: Group) -> str:
     return " ".join(part for part in group if part)
 
 
+def legend(groups: Iterable[Group]) -> dict[Group, str]:
+    """Names for a legend: without the flags that all settings of a recipe share, in lines of 40 characters."""
+    flags = {group: re.findall(r"--\S+(?: (?!--)\S+)*", group[1]) for group in groups}
+    shared = {
+        recipe: set.intersection(*(set(own) for (other, _), own in flags.items() if other == recipe))
+        for recipe, _ in flags
+    }
+    return {
+        (recipe, settings): fill(name((recipe, " ".join(flag for flag in own if flag not in shared[recipe]))), 40)
+        for (recipe, settings), own in flags.items()
+    }
+
+
 def _draw_curves(rows: Sequence[Mapping[str, str]], out: Path, x: str) -> None:
     from matplotlib.figure import Figure
 
     runs: dict[str, dict[Group, dict[str, list[tuple[float, float]]]]] = defaultdict(lambda: defaultdict(dict))
+    names = legend((r["recipe"], r["settings"]) for r in rows)
     for r in rows:
         group = runs[r["env"]][r["recipe"], r["settings"]]
         group.setdefault(r["seed"], []).append((float(r[x]), float(r["eval_mean"])))
@@ -177,7 +193,7 @@ def _draw_curves(rows: Sequence[Mapping[str, str]], out: Path, x: str) -> None:
     panels = figure.subplots(-(-len(runs) // 3), min(len(runs), 3), squeeze=False).flat
     for axes, (env, groups) in zip(panels, runs.items(), strict=False):
         for number, (group, curves) in enumerate(groups.items()):
-            _draw_band(axes, list(curves.values()), label=f"{name(group)} ({len(curves)})", color=f"C{number}")
+            _draw_band(axes, list(curves.values()), label=f"{names[group]} ({len(curves)})", color=f"C{number}")
         axes.set(title=env, xlabel=x, ylabel="evaluation return")
         axes.grid(alpha=0.3)
         axes.legend(frameon=False, fontsize="small")
@@ -205,9 +221,9 @@ def _draw_profiles(scores: Mapping[tuple[str, Group], list[float]], out: Path) -
     thresholds = np.linspace(0, 1, 101)
     figure = Figure(figsize=(5.5, 3.8), layout="constrained")
     axes = figure.subplots()
-    for group in dict.fromkeys(group for _, group in scores):
+    for group, label in legend(group for _, group in scores).items():
         tasks = [np.array(v) / (best[env] or 1.0) for (env, other), v in scores.items() if other == group]
-        axes.plot(thresholds, statistics.performance_profile(tasks, thresholds), label=name(group))
+        axes.plot(thresholds, statistics.performance_profile(tasks, thresholds), label=label)
     axes.set(xlabel="score / best score of the environment", ylabel="share of runs above", ylim=(0, 1.02))
     axes.grid(alpha=0.3)
     axes.legend(frameon=False, fontsize="small")

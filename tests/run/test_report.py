@@ -6,7 +6,7 @@ import pytest
 
 from pgkit.errors import UserError
 from pgkit.run import experiment
-from pgkit.run.report import report
+from pgkit.run.report import legend, report
 
 
 def write(path, columns, rows):
@@ -55,3 +55,15 @@ def test_text_around_the_marks_stays(tmp_path):
         assert text == page.read_text() and "old" not in text and text.count("| X-v1 |") == 1
         assert text.startswith("# Mine\n\nBefore.\n\n<!-- report -->\n\n| env |")
         assert text.endswith("\n\n<!-- end of report -->\n\nAfter.\n")
+
+
+def test_a_legend_has_no_flags_that_all_share_so_that_the_curves_keep_their_room(tmp_path):
+    long = "--total-frames 2048 --num-envs 4 --steps 64 --epochs 2 --hidden 64 64 --compile off --eval-episodes 2"
+    groups = [("ppo", long), ("ppo", f"{long} --learning-rate 1e-3"), ("sac", long)]
+    assert list(legend(groups).values()) == ["ppo", "ppo --learning-rate 1e-3", "sac"]
+    assert legend([("ppo", "--hidden 64 64"), ("ppo", "--hidden 256")])["ppo", "--hidden 256"] == "ppo --hidden 256"
+    results = [[recipe, "X-v1", flags, seed, 20, 10.0, 2, 100, ""] for recipe, flags in groups for seed in (1, 2)]
+    write(tmp_path / "t.csv", experiment.COLUMNS, results)
+    points = [[recipe, "X-v1", flags, seed, 20, 10.0, 2] for recipe, flags in groups for seed in (1, 2)]
+    write(tmp_path / "t-curves.csv", experiment.CURVE, points)
+    report([tmp_path / "t.csv"], tmp_path / "r.md")  # matplotlib warns where the legend leaves no room

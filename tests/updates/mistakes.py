@@ -251,7 +251,7 @@ def a_loss_a_row() -> None:
 
 
 def no_loss_entry() -> None:
-    """A loss of one's own returns its result under a name that does not begin with ``loss_``."""
+    """A loss of your own returns its result under a name that does not begin with ``loss_``."""
     agent = Agent()
     stock = agent.loss.forward
     agent.loss.forward = lambda batch: stock(batch).select("loss_objective").rename_key_("loss_objective", "objective")
@@ -259,7 +259,7 @@ def no_loss_entry() -> None:
 
 
 def own_loss_that_broadcasts() -> None:
-    """A loss of one's own multiplies log-probabilities ``(B,)`` with advantages ``(B, 1)``."""
+    """A loss of your own multiplies log-probabilities ``(B,)`` with advantages ``(B, 1)``."""
     agent = Agent()
 
     class Mine(losses.PolicyLoss):
@@ -313,7 +313,7 @@ def critic_of_two_values() -> None:
 
 
 def advantage_with_a_gradient() -> None:
-    """An advantage block of one's own keeps the graph of its critic."""
+    """An advantage block of your own keeps the graph of its critic."""
     agent = Agent()
     agent.advantage = MyAdvantage(
         lambda rollout: rollout.set("advantage", agent.critic(rollout.copy())["state_value"]),
@@ -388,16 +388,16 @@ def section(mistake: Callable[[], None]) -> str:
 INTRO = """# Errors
 
 An update checks the assembled agent once, before its first step: entries, shapes, types, devices, actions, parameters,
-and that gamma and lambda have one owner. What it finds is one line that says which entry or parameter is wrong, who
-writes it, who reads it, what was expected and what was found. A shape `(B,)` where `(B, 1)` belongs is never broadcast.
+and that gamma and lambda have one owner. A mistake gives one line. It names the entry or parameter, who writes it and
+who reads it, what was expected and what was found. A shape `(B,)` in place of `(B, 1)` is never broadcast.
 
-To see who writes and who reads what before training, `print(update)`, or `pgkit run ppo --explain`:
+`print(update)`, or `pgkit run ppo --explain`, shows before the training who writes and who reads each entry:
 
 ```text
 {diagram}
 ```
 
-The mistakes below are planted by `tests/updates/mistakes.py`, which also writes this page; a test compares the two.
+`tests/updates/mistakes.py` makes these mistakes on purpose and writes this page; a test compares the two.
 """
 
 
