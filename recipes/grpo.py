@@ -29,7 +29,7 @@ class Args(run.RunArgs):
     """Evaluate and save a checkpoint every so many completions; 0 = only at the end."""
     eval_episodes: int = 2_000
     """Held-out prompts, completed at temperature 1, in each evaluation."""
-    prompts: int = run.setting(64, low=1)
+    prompts: int = run.setting(128, low=1)
     """Prompts of a rollout."""
     group_size: int = run.setting(16, low=2)
     """Completions of each prompt."""
@@ -41,11 +41,11 @@ class Args(run.RunArgs):
     """Passes over a rollout."""
     minibatches: int = run.setting(4, low=1)
     """Gradient steps of a pass."""
-    learning_rate: float = run.setting(1e-4, low=0)
+    learning_rate: float = run.setting(2e-4, low=0)
     """Adam's step size."""
     max_grad_norm: float = run.setting(1.0, above=0)
     """Bound of the gradient's norm."""
-    advantage: Literal["group", "mean", "leave_one_out", "batch", "gae"] = "group"
+    advantage: Literal["group", "mean", "leave_one_out", "batch", "gae"] = "mean"
     """Against the group: by mean and deviation, mean alone (Dr. GRPO), the others' mean (RLOO), the batch's deviation.
     gae: PPO with a value head."""
     drop: bool = True
