@@ -22,7 +22,7 @@ from pgkit.compiled import chosen, set_matmul
 from pgkit.envs import vector_of
 from pgkit.errors import Diverged, UserError
 from pgkit.run import checkpoint, config, directory, ending, seeding
-from pgkit.run.agent import Agent
+from pgkit.run.agent import Agent, as_built
 from pgkit.run.args import RunArgs, check
 from pgkit.run.clock import Clock
 from pgkit.run.evaluate import evaluate
@@ -174,7 +174,9 @@ class Run:
         elif self.args.init:
             folder = self.args.init / "checkpoints"
             path = folder / ("best.pt" if (folder / "best.pt").exists() else "latest.pt")
-            checkpoint.restore({"agent": self._agent}, {"agent": checkpoint.load(path)["states"].get("agent")}, path)
+            begun_with = {"agent": checkpoint.load(path)["states"].get("agent")}
+            with as_built(self._agent):
+                checkpoint.restore({"agent": self._agent}, begun_with, path)
         if not self._saved:
             self._lock = directory.claim(self.dir, self.args, self.recipe)
             self._claimed = True
