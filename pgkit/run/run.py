@@ -379,6 +379,7 @@ class Run:
         _log.warning("the run ends at an error; %s has %s%s", self.dir, where, f" ({why})" if why else "")
 
     def _finish(self) -> None:
+        is_saved = self._saved_at == self.frames
         if self._evaluated.get("frames") != self.frames:
             try:
                 scores = self._evaluate({})
@@ -386,7 +387,8 @@ class Run:
                 self.save()
                 raise
             self._metrics.write({"frames": self.frames, "time/wall_s": self._clock.wall, **scores})
-        if self._saved_at != self.frames:
+            is_saved = False  # the checkpoint knows the rows, and the best policy
+        if not is_saved:
             self.save()
         plot([self.dir], self.dir / "curve.png")
         ending.write_summary(self.dir, self.args, self.recipe, self._clock.wall, self._evaluated, self.best)  # the last
