@@ -211,7 +211,7 @@ def main(args: Args) -> None:
             if args.eval_every and collector.frames % args.eval_every < rows:
                 metrics |= {"eval/greedy": share_solved(test, greedy)}
             log.step(collector.frames, rollout.unsqueeze(1), metrics)
-        collector.shutdown()
+    collector.shutdown()
 
 
 if __name__ == "__main__":

@@ -192,9 +192,9 @@ def main(args: Args) -> None:
             if built.scale is not None:
                 built.scale.update(rollout["value_target"])
             log.step(collector.frames, rollout, metrics)
-        collector.shutdown()
-        if isinstance(update, updates.RayLearners):
-            update.shutdown()
+    collector.shutdown()
+    if isinstance(update, updates.RayLearners):
+        update.shutdown()
 
 
 if __name__ == "__main__":
