@@ -307,6 +307,25 @@ def test_a_state_taken_before_the_first_rollout_is_restored(workers):
     other.shutdown()
 
 
+@pytest.mark.parametrize(
+    ("kind", "workers"),
+    [(collectors.VectorCollector, 1), (collectors.VectorCollector, 2), (collectors.AsyncCollector, 1)],
+)
+def test_a_state_taken_after_the_shutdown_begins_new_episodes(kind, workers):
+    """A run saves after ``break`` and ``shutdown()``."""
+    seen = []
+    env = envs.make("CartPole-v1", num_envs=2, seed=3, workers=workers)
+    state = None
+    for _ in range(2):
+        collector = kind(env, modules.categorical_actor(env), frames_per_batch=20, compile="off")
+        if state is not None:
+            collector.load_state_dict(state)
+        seen.append(collector.rollout()["observation"][:, 0])
+        collector.shutdown()
+        state = collector.state_dict()
+    assert collector.frames == 40 and not torch.equal(*seen)
+
+
 def test_noise_that_is_kept_in_the_tensordict_is_refused():
     env = envs.make("Pendulum-v1", num_envs=2)
     noise = OrnsteinUhlenbeckProcessModule(spec=env.action_spec, annealing_num_steps=100)
