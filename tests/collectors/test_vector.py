@@ -326,6 +326,14 @@ def test_a_state_taken_after_the_shutdown_begins_new_episodes(kind, workers):
     assert collector.frames == 40 and not torch.equal(*seen)
 
 
+def test_an_actor_writes_whole_numbers_too_and_a_random_one_zeros():
+    env = envs.make("Pendulum-v1", num_envs=2)
+    skill = TensorDictModule(lambda x: (x[:, :1] > -2).long(), in_keys=["observation"], out_keys=["skill"])
+    actor = TensorDictSequential(skill, modules.deterministic_actor(env))
+    collector = collectors.VectorCollector(env, actor, frames_per_batch=4, init_random_frames=4, compile="off")
+    assert [collector.rollout()["skill"].unique().tolist() for _ in range(2)] == [[0], [1]]
+
+
 def test_noise_that_is_kept_in_the_tensordict_is_refused():
     env = envs.make("Pendulum-v1", num_envs=2)
     noise = OrnsteinUhlenbeckProcessModule(spec=env.action_spec, annealing_num_steps=100)
