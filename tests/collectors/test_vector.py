@@ -202,6 +202,19 @@ def test_torchrl_collector_gives_the_same_seam():
     assert torch.equal(rollouts[0]["next", "episode_reward"][done], lengths.float())
 
 
+def test_the_environment_that_torchrl_s_collector_is_checked_with_is_closed(monkeypatch):
+    made = []
+
+    def maker():
+        made.append(GymEnv("Pendulum-v1"))
+        return made[-1]
+
+    monkeypatch.setattr("torchrl.collectors.Collector", lambda *args, **kwargs: None)
+    actor = modules.deterministic_actor(envs.make("Pendulum-v1"))
+    collectors.TorchRLCollector([maker, maker], actor, frames_per_batch=10)
+    assert [env.is_closed for env in made] == [True]
+
+
 def test_torchrl_environments_that_do_not_fit_are_named():
     env = GymEnv("InvertedPendulum-v5")  # its observations are float64
     actor = modules.gaussian_actor(env)
