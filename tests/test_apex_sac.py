@@ -5,6 +5,7 @@ import logging
 import os
 import sys
 import time
+from functools import partial
 from types import SimpleNamespace
 
 import pytest
@@ -105,6 +106,10 @@ def test_a_shard_gives_batches_and_takes_late_errors_of_frames_that_it_still_has
     assert by_frame == [7, 2, 1, 1, 1, 1, 1, 0.5]
     ages = [float(made.made_at[frame % made.buffer.rows]) for frame in range(2, 10)]
     assert ages == [9, 3, 5, 5, 5, 5, 5, 9]
+
+
+def test_a_function_goes_to_other_machines_with_the_arguments_that_it_has():
+    assert ray.cloudpickle.loads(shipped(partial(shard(capacity=6), 3)))().capacity == 6
 
 
 def test_the_learner_reads_writes_back_and_goes_on_without_a_shard(cluster, caplog):
