@@ -50,6 +50,8 @@ def connect(address: str | None = None, cpus: int = 1) -> None:
             raise UserError(
                 f"--ray-address {address}: no Ray cluster answers there; start one with: ray start --head"
             ) from error
+        except ValueError as error:
+            raise UserError(f"--ray-address {address}: give auto, HOST:6379 or ray://HOST:10001") from error
         return
     os.environ.setdefault("RAY_worker_niceness", "0")  # Ray's own 15 lets everything else on the machine go first
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")

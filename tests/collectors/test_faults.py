@@ -273,3 +273,8 @@ def test_too_few_files_for_workers_is_one_line(spare: int):
             collector.rollout()
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+
+
+def test_an_address_of_a_cluster_that_is_none_is_one_line():
+    with pytest.raises(UserError, match="--ray-address nonsense: give auto, HOST:6379"):
+        collectors.connect("nonsense")
