@@ -209,6 +209,7 @@ def main(args: Args) -> None:
         for rollout in collector:
             metrics = update(rollout) | collector.metrics
             if args.eval_every and collector.frames % args.eval_every < rows:
+                test.set_seed(args.seed + collector.frames)  # a resumed run asks the same prompts
                 metrics |= {"eval/greedy": share_solved(test, greedy)}
             log.step(collector.frames, rollout.unsqueeze(1), metrics)
     collector.shutdown()

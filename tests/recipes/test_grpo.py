@@ -33,9 +33,9 @@ def train(run_dir, *argv, frames=96):
 
 
 def test_same_seed_same_metrics_and_a_resumed_run_equals_the_straight_one(tmp_path):
-    train(tmp_path / "a", "--task", "sorting")
+    train(tmp_path / "a", "--task", "sorting", frames=128)  # greedy actions are tried at 64 and 128
     train(tmp_path / "b", "--task", "sorting", frames=64)
-    pgkit("run", "grpo", "--resume", tmp_path / "b", "--total-frames", 96)
+    pgkit("run", "grpo", "--resume", tmp_path / "b", "--total-frames", 128)
     assert rows(tmp_path / "a") == rows(tmp_path / "b")
     summary = json.loads((tmp_path / "a" / "summary.json").read_text())
     assert 0 <= summary["eval/mean_reward"] <= 1 and summary["env_id"] == "sorting"
