@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import torch
@@ -14,7 +15,10 @@ def shipped(function: Callable[..., Any]) -> bytes:
     """A function for processes on other machines: with its whole module where that is no installed one."""
     import cloudpickle
 
-    module = sys.modules[function.__module__]
+    inner = function
+    while isinstance(inner, partial):
+        inner = inner.func
+    module = sys.modules[inner.__module__]
     own = module.__name__ != "__main__" and not module.__name__.startswith("pgkit.")
     if not own:
         return cloudpickle.dumps(function)

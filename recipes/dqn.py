@@ -143,7 +143,7 @@ def main(args: Args) -> None:
             explore.step(rollout.numel())
             metrics["epsilon"] = float(explore.eps)
             log.step(collector.frames, rollout, metrics, every=args.log_every)
-        collector.shutdown()
+    collector.shutdown()
 
 
 if __name__ == "__main__":

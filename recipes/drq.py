@@ -139,7 +139,7 @@ def main(args: Args) -> None:
         log.track(agent=built, eval_env=args.make_env, update=update, collector=collector, replay=replay)
         for rollout in collector:
             log.step(collector.frames, rollout, update(rollout), every=args.log_every)
-        collector.shutdown()
+    collector.shutdown()
 
 
 if __name__ == "__main__":

@@ -158,7 +158,7 @@ def main(args: Args) -> None:
                 group["lr"] = rate(collector.frames / args.total_frames)
             metrics = update(rollout)
             log.step(collector.frames, rollout, metrics, every=args.log_every)
-        collector.shutdown()
+    collector.shutdown()
 
 
 if __name__ == "__main__":

@@ -80,7 +80,7 @@ class Args(run.RunArgs):
     """perfect: the warm start learns from correct solutions, for comparison."""
 
     def __post_init__(self) -> None:
-        if self.init is not None and not (self.init / "checkpoints").is_dir():
+        if self.init is not None and self.init.exists() and not (self.init / "checkpoints").is_dir():
             self.model, self.init = self.init, None
         self.env_id, self.num_envs = self.task, self.prompts
 
@@ -198,8 +198,10 @@ def main(args: Args) -> None:
         )
         kept = {"reference": reference} if reference is not None else {}
         log.track(agent=built, eval_env=args.make_env, update=update, collector=collector, **kept)
-        if reference is not None and args.init:
-            reference.load_state_dict(policy.actor.state_dict())  # what --init gave the actor
+        if args.init and not args.resume:
+            policy.actor.temperature.fill_(args.temperature)  # --init gave the actor its own
+            if reference is not None:
+                reference.load_state_dict(policy.actor.state_dict())
         greedy, test = (
             modules.TokenPolicy(policy.actor, env.completion_length, greedy=True),
             args.make_env(1, args.seed),
@@ -207,9 +209,10 @@ def main(args: Args) -> None:
         for rollout in collector:
             metrics = update(rollout) | collector.metrics
             if args.eval_every and collector.frames % args.eval_every < rows:
+                test.set_seed(args.seed + collector.frames)  # a resumed run asks the same prompts
                 metrics |= {"eval/greedy": share_solved(test, greedy)}
             log.step(collector.frames, rollout.unsqueeze(1), metrics)
-        collector.shutdown()
+    collector.shutdown()
 
 
 if __name__ == "__main__":

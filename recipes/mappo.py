@@ -208,7 +208,7 @@ def main(args: Args) -> None:
                 if built.scale is not None:
                     built.scale[group].update(rollout[group, "value_target"], mask=mask)
             log.step(collector.frames, rollout, metrics)
-        collector.shutdown()
+    collector.shutdown()
 
 
 if __name__ == "__main__":

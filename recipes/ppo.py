@@ -171,12 +171,13 @@ def main(args: Args) -> None:
         )
         if args.learners > 1:
             collectors.connect(args.ray_address, args.processes() + args.learners)
-            update = updates.RayLearners(update, args.learners)
+            update = updates.RayLearners(update, args.learners, timeout=args.ray_wait)
         frames = args.num_envs * args.steps
         if args.collector == "pgkit":
             collector = run.collector(args, env, built.actor, frames_per_batch=frames, overlap=args.overlap)
-        elif args.overlap:
-            raise UserError("--overlap: TorchRL's Collector waits for the update; leave --collector at pgkit")
+        elif args.overlap or args.ray:
+            given = "--overlap" if args.overlap else "--ray"
+            raise UserError(f"{given}: TorchRL's Collector waits for the update, here; leave --collector at pgkit")
         else:
             collector = collectors.TorchRLCollector(
                 env, built.actor, frames_per_batch=frames, total_frames=args.total_frames
@@ -192,9 +193,9 @@ def main(args: Args) -> None:
             if built.scale is not None:
                 built.scale.update(rollout["value_target"])
             log.step(collector.frames, rollout, metrics)
-        collector.shutdown()
-        if isinstance(update, updates.RayLearners):
-            update.shutdown()
+    collector.shutdown()
+    if isinstance(update, updates.RayLearners):
+        update.shutdown()
 
 
 if __name__ == "__main__":

@@ -158,7 +158,7 @@ def main(args: Args) -> None:
             if built.scale is not None:
                 built.scale.update(batch["value_target"][: args.num_envs])
             log.step(collector.frames, rollout, metrics)
-        collector.shutdown()
+    collector.shutdown()
 
 
 if __name__ == "__main__":

@@ -120,7 +120,7 @@ def main(args: Args) -> None:
             if built.scale is not None:
                 built.scale.update(rollout["value_target"], built.critic)
             log.step(collector.frames, rollout, metrics)
-        collector.shutdown()
+    collector.shutdown()
 
 
 if __name__ == "__main__":

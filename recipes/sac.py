@@ -211,7 +211,7 @@ def main(args: Args) -> None:
             if args.overlap:
                 metrics["policy_lag"] = collector.lag
             log.step(collector.frames, rollout, metrics, every=args.log_every)
-        collector.shutdown()
+    collector.shutdown()
 
 
 if __name__ == "__main__":

@@ -2,8 +2,10 @@
 
 import json
 import logging
+import os
 import sys
 import time
+from functools import partial
 from types import SimpleNamespace
 
 import pytest
@@ -16,7 +18,7 @@ from pgkit import data, envs, losses, modules, run, updates
 from pgkit.cli import recipes
 from pgkit.collectors import RayExplorers, connect
 from pgkit.data.ray_replay import _Shard
-from pgkit.errors import UserError
+from pgkit.errors import EnvironmentFailed, UserError
 from pgkit.messages import shipped
 from tests.data.test_replay import hand_made
 from tests.recipes.test_ppo import pgkit, rows
@@ -106,6 +108,10 @@ def test_a_shard_gives_batches_and_takes_late_errors_of_frames_that_it_still_has
     assert ages == [9, 3, 5, 5, 5, 5, 5, 9]
 
 
+def test_a_function_goes_to_other_machines_with_the_arguments_that_it_has():
+    assert ray.cloudpickle.loads(shipped(partial(shard(capacity=6), 3)))().capacity == 6
+
+
 def test_the_learner_reads_writes_back_and_goes_on_without_a_shard(cluster, caplog):
     replay = data.RayReplay(shard(capacity=400), shards=2, batch_size=4, batches=3, least=4)
     assert not replay.ready() and len(replay) == 0
@@ -189,6 +195,27 @@ def test_explorers_keep_the_pace_that_they_are_given(cluster):
     assert explorers.frames == 200 and explorers.restarts == 1
     assert explorers.collect(None) is None
     explorers.shutdown()
+
+
+def test_an_explorer_that_cannot_begin_ends_the_run_and_says_why(cluster, monkeypatch):
+    def sinks(number, seed, frames):
+        raise UserError("no wind")
+
+    def burns(number, seed, frames):
+        return lambda weights: os._exit(1)
+
+    def calls(make):
+        store = SimpleNamespace(emptiest=lambda frames: (0, None))
+        explorers = RayExplorers(make, 1, store, frames_per_call=10, total_frames=100)
+        explorers.publish({}, 0)
+        for _ in range(5):
+            explorers.collect(None)
+
+    with pytest.raises(UserError, match="^no wind$"):
+        calls(sinks)
+    monkeypatch.setattr("pgkit.collectors.ray_explorers.MOST_DEATHS", 2)
+    with pytest.raises(EnvironmentFailed, match="explorer 0 ended 2 times at the same call"):
+        calls(burns)
 
 
 def test_the_recipe_trains_with_deaths_and_resumes(cluster, tmp_path, caplog, monkeypatch, recipe):

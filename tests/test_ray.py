@@ -15,7 +15,7 @@ import torch
 
 from pgkit import collectors, envs, modules
 from pgkit.cli import recipes
-from pgkit.collectors.cluster import connect
+from pgkit.collectors.cluster import Waiting, connect
 from pgkit.errors import UserError
 from pgkit.run.settings import parse
 
@@ -142,6 +142,23 @@ def test_a_cluster_without_a_place_says_what_it_lacks():
     ray.kill(guest)
     with pytest.raises(UserError, match="--collectors is for runs on Ray: add --ray"):
         parse(recipes.load(recipes.find("ppo")).Args, {}, ["--collectors", "3"]).processes()
+
+
+def test_the_wait_for_a_place_begins_where_one_is_missing():
+    """An actor that dies in a long evaluation has the whole time to find another."""
+
+    class Giant:
+        def sits(self) -> None: ...
+
+    giant = ray.remote(num_cpus=1000)(Giant).remote()
+    waiting, there = Waiting("collecting processes", limit=0.3), ray.put(0)
+    assert waiting.go_on([there], timeout=1.0)
+    time.sleep(0.4)
+    assert not waiting.go_on([there, giant.sits.remote()], timeout=0.0)
+    time.sleep(0.4)
+    with pytest.raises(UserError, match="1 of 2 collecting processes have no place yet"):
+        waiting.go_on([there, giant.sits.remote()], timeout=0.0)
+    ray.kill(giant)
 
 
 def test_actors_at_their_own_pace_stay_within_the_bound_also_where_one_dies():

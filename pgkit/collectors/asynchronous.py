@@ -112,18 +112,18 @@ class AsyncCollector:
         buffers = self._done[group] or self._groups[group].finish()
         self._done[group] = None
         self.lag = self._updates - self._versions[group]
+        self._order(group)
         rollout = as_rollout(buffers, self.env)
         self.frames += count(rollout)
-        self._order(group)
         self._updates += 1
         return self._beside.bring(rollout)
 
     def state_dict(self) -> dict[str, Any]:
         """Counters, rollouts that are collected but not handed out yet, and every environment's state.
 
-        After a rollout that failed, the environments have none: they begin new episodes.
+        After a rollout that failed, or :meth:`shutdown`, the environments have none: they begin new episodes.
         """
-        if not all(workers.is_open for workers in self._groups):
+        if not all(workers.is_open for workers in self._groups) or (self._updates and not self._groups):
             gone = [[lost(count * self._steps)] for count in self._orders]
             return self._counters() | {"done": [None] * len(gone), "envs": gone}
         for group, workers in enumerate(self._groups):

@@ -41,7 +41,7 @@ def function_of(actor: TensorDictModuleBase, keys: Sequence[Key]) -> Act:
 def random_actions(spec: Composite, keys: Sequence[Key], outputs: Entries) -> Act:
     """A policy that draws actions uniformly from ``spec``, of those that an ``action_mask`` allows.
 
-    Its other outputs, shaped as ``outputs``, are NaN; a recurrent state stays zero.
+    Its other outputs, shaped as ``outputs``, are NaN; whole numbers and a recurrent state are zero.
     """
     rows = spec.shape[0]
     masks = {key: (*key[:-1], "action_mask") if isinstance(key, tuple) else "action_mask" for key in outputs}
@@ -51,7 +51,8 @@ def random_actions(spec: Composite, keys: Sequence[Key], outputs: Entries) -> Ac
         made = []
         for key, x in outputs.items():
             if key not in spec.keys(True, True):
-                made.append(torch.full_like(x[:rows], 0.0 if is_state(key) else torch.nan))
+                unknown = torch.nan if x.dtype.is_floating_point and not is_state(key) else 0
+                made.append(torch.full_like(x[:rows], unknown))
             elif masks[key] in given:
                 made.append(_allowed(spec[key], given[masks[key]].bool()))
             else:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from logging import getLogger
 from typing import Any, Protocol
@@ -13,7 +13,8 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from pgkit.collectors.cluster import Waiting, ray_module
+from pgkit.collectors.cluster import MOST_DEATHS, Waiting, failed, ray_module
+from pgkit.collectors.workers import WorkerEnded
 from pgkit.messages import packed, shipped
 
 Weights = Mapping[str, Tensor]
@@ -50,6 +51,7 @@ class RayExplorers:
 
     Raises:
         UserError: while collecting, the cluster has no place for an explorer.
+        EnvironmentFailed: while collecting, an explorer died three times at one call.
 
     Attributes:
         frames: frames collected.
@@ -79,7 +81,7 @@ class RayExplorers:
         self._seed, self._niceness, self._wait, self._begun = seed, niceness, wait, 0
         self._since: tuple[int, int] | None = None  # frames begun and updates where the limit began to hold
         self._weights: Any = None
-        self._idle = deque[int]()
+        self._idle, self._deaths = deque[int](), Counter[int]()  # deaths of an explorer since its last rollout
         self._actors, self._ready = dict[int, Any](), dict[int, Any]()
         self._running = dict[Any, tuple[int, int, Any]]()  # the call -> explorer, shard and its handle
 
@@ -125,8 +127,8 @@ class RayExplorers:
         """Ends the actors."""
         for actor in self._actors.values():
             ray_module().kill(actor)
-        self._running.clear()
-        self._actors.clear()
+        for held in (self._running, self._actors, self._ready, self._idle):
+            held.clear()
 
     def _most(self, updates: int | None) -> float:
         """Frames of which calls may have begun."""
@@ -153,7 +155,14 @@ class RayExplorers:
         number, shard, handle = self._running.pop(call)
         try:
             report, stored = ray.get(call)
-        except ray.exceptions.RayActorError:
+        except ray.exceptions.RayTaskError as error:
+            self.shutdown()
+            failed(error, f"explorer {number}")
+        except ray.exceptions.RayActorError as error:
+            self._deaths[number] += 1
+            if self._deaths[number] >= MOST_DEATHS:
+                self.shutdown()
+                raise WorkerEnded(f"explorer {number} ended {MOST_DEATHS} times at the same call: {error}") from None
             getLogger("pgkit").warning("explorer %d is gone: another takes its place", number)
             self.restarts += 1
             self._begun -= self.frames_per_call
@@ -161,6 +170,7 @@ class RayExplorers:
             return None
         self.store.told(shard, handle, self.frames_per_call, stored)
         self._idle.append(number)
+        self._deaths[number] = 0
         self.frames += self.frames_per_call
         return report
 
@@ -178,13 +188,16 @@ class _Explorer:
     def __init__(self, make: bytes, number: int, seed: int, frames: int, niceness: int) -> None:
         os.nice(niceness)
         torch.set_num_threads(1)
-        self.explore: Explore = ray_module().cloudpickle.loads(make)(number, seed, frames)
+        self._order, self._explore = (make, number, seed, frames), None
 
     def collect(self, published: tuple[dict[str, np.ndarray], int], shard: Any) -> tuple[dict[Any, Any], Any]:
         """What the rollout has of episodes, and what the shard says; None if it is dead."""
         ray = ray_module()
+        if self._explore is None:  # here: what fails in an actor's constructor looks like a death
+            make, *given = self._order
+            self._explore = ray.cloudpickle.loads(make)(*given)
         weights, updates = published
-        rollout = self.explore({key: torch.tensor(x) for key, x in weights.items()})
+        rollout = self._explore({key: torch.tensor(x) for key, x in weights.items()})
         message = packed(rollout)
         try:
             stored = ray.get(shard.extend.remote(message, updates))

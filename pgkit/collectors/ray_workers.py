@@ -18,17 +18,16 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from pgkit.collectors.blocks import Layout
-from pgkit.collectors.cluster import Waiting, ray_module
+from pgkit.collectors.cluster import MOST_DEATHS, Waiting, failed, ray_module
 from pgkit.collectors.rebuild import Known, Past
 from pgkit.collectors.stepping import Share, allocate, regroup
 from pgkit.collectors.workers import WorkerEnded, shares
 from pgkit.compiled import Mode, load_matmul_state, matmul_state
 from pgkit.envs import VectorEnv
-from pgkit.errors import EnvironmentFailed, UserError
+from pgkit.errors import UserError
 from pgkit.seams import Entries, MakeSimulator
 
 _TICK = 0.5  # seconds between looks at what is slow to come
-_MOST_DEATHS = 3  # of one actor at one rollout
 
 
 class RayWorkers:
@@ -177,9 +176,7 @@ class RayWorkers:
             self._refs[i], self._asked[i], self._deaths[i] = None, None, 0
         except errors.RayTaskError as error:
             self.close()
-            if isinstance(error.cause, UserError | EnvironmentFailed):
-                raise error.cause from None
-            raise RuntimeError(f"collecting process {i} failed:\n{error.traceback_str}") from None
+            failed(error, f"collecting process {i}")
         except gone as error:
             self._replace(i, str(error))
 
@@ -202,9 +199,9 @@ class RayWorkers:
         self.deaths += 1
         lost = self._known[i].lost()
         self.lost += lost
-        if self._deaths[i] >= _MOST_DEATHS:
+        if self._deaths[i] >= MOST_DEATHS:
             self.close()
-            raise WorkerEnded(f"collecting process {i} ended {_MOST_DEATHS} times at the same request: {reason}")
+            raise WorkerEnded(f"collecting process {i} ended {MOST_DEATHS} times at the same request: {reason}")
         getLogger("pgkit").warning(
             "collecting process %d ended (killed, out of memory, or its node is gone): it is made again, %s",
             i, f"and {lost} episodes begin anew" if lost else "and collects the same rollout",

@@ -31,10 +31,10 @@ def allocate(steps: int, env: VectorEnv, outputs: Entries) -> Entries:
         flag = torch.zeros(env.num_envs, 1, dtype=torch.bool, device=env.device)
         path: Any = path_of(key)[1:]
         made |= {path if len(path) > 1 else path[0]: outputs[key], "is_init": flag, ("next", "is_init"): flag}
-    made |= {("next", *_path(key)): x for key, x in [*_specs(env.observation_spec), *_specs(env.info_spec)]}
+    made |= {("next", *path_of(key)): x for key, x in [*_specs(env.observation_spec), *_specs(env.info_spec)]}
     for key, spec in _specs(env.full_reward_spec):
-        made |= {("next", *_path(key)): spec, ("next", *_total(key)): spec}
-    made |= {("next", *_path(key)): spec for key, spec in _specs(env.full_done_spec) if _path(key)[-1] != "done"}
+        made |= {("next", *path_of(key)): spec, ("next", *_total(key)): spec}
+    made |= {("next", *path_of(key)): spec for key, spec in _specs(env.full_done_spec) if path_of(key)[-1] != "done"}
     made["next", "step_count"] = torch.zeros(env.num_envs, 1, dtype=torch.int64)
     if env.masks:
         made[MASK] = torch.ones(env.num_envs, dtype=torch.bool)
@@ -78,7 +78,7 @@ class Share:
         self._keys = [*self._observed, *self._memory]
         self._now, self._decided = _rows(buffers, self._keys), _rows(buffers, self._outputs)
         counted = buffers | {("next", "step_count"): buffers["next", "step_count"].squeeze(-1)}
-        self._next = _rows(counted, [("next", *_path(key)) for key in self._after()])
+        self._next = _rows(counted, [("next", *path_of(key)) for key in self._after()])
         self._mask = buffers[MASK].unbind(0) if simulator.masks else None
         spec = simulator.action_spec
         padded = padded_rows(self._now[0], num_envs)
@@ -90,7 +90,7 @@ class Share:
         """The entries of a step in the order in which they are written."""
         sim = self.simulator
         rewards = [key for key, _ in _specs(sim.reward_spec)]
-        ends = [_path(key)[:-1] for key, _ in _specs(sim.done_spec) if _path(key)[-1] == "done"]
+        ends = [path_of(key)[:-1] for key, _ in _specs(sim.done_spec) if path_of(key)[-1] == "done"]
         flags: list[Key] = [*[(*path, "terminated") for path in ends], *[(*path, "truncated") for path in ends]]
         infos = [key for key, _ in _specs(sim.info_spec)]
         return [*self._observed, *rewards, *flags, *infos, *[_total(key) for key in rewards], "step_count"]
@@ -193,10 +193,10 @@ def regroup(states: Sequence[dict[str, Any]], bounds: Sequence[int]) -> list[dic
 def as_rollout(buffers: Entries, env: VectorEnv) -> TensorDictBase:
     """The buffers ``[T, N, ...]`` as a TensorDict ``[N, T]``, without a copy, and ``("next", ..., "done")``."""
     tensors: dict[Any, Tensor] = {key: x.transpose(0, 1) for key, x in buffers.items()}
-    for key in [key for key in tensors if _path(key)[-1] == "terminated"]:
+    for key in [key for key in tensors if path_of(key)[-1] == "terminated"]:
         tensors[(*key[:-1], "done")] = tensors[key] | tensors[(*key[:-1], "truncated")]
     _check(tensors, env)
-    return _nested({_path(key): x for key, x in tensors.items()}, env.groups)
+    return _nested({path_of(key): x for key, x in tensors.items()}, env.groups)
 
 
 def _nested(
@@ -219,16 +219,16 @@ def _nested(
 def _check(tensors: dict[Any, Tensor], env: VectorEnv) -> None:
     """A ``UserError`` for numbers that are not finite, and for masks that allow no action."""
     for key, _ in _specs(env.observation_spec):
-        for where in (("next", *_path(key)), key):
+        for where in (("next", *path_of(key)), key):
             _check_finite(tensors[where], where)
-        if _path(key)[-1] == "action_mask":
-            spec = env.full_action_spec[(*_path(key)[:-1], "action")]
+        if path_of(key)[-1] == "action_mask":
+            spec = env.full_action_spec[(*path_of(key)[:-1], "action")]
             if not all(x.any(-1).all() for x in choices(spec, tensors[key])):
                 raise UserError(
                     "the environment's action_mask allows no action in some state: it must allow at least one"
                 )
     for key, _ in _specs(env.full_reward_spec):
-        where = ("next", *_path(key))
+        where = ("next", *path_of(key))
         _check_finite(tensors[where], where)
 
 
@@ -240,7 +240,7 @@ def _check_finite(x: Tensor, key: Key) -> None:
         return
     wrong = ~(x.abs() <= LARGEST)
     row, step = wrong.nonzero()[0, :2].tolist()
-    found, name = x[row, step][wrong[row, step]].flatten()[0].item(), ".".join(_path(key))
+    found, name = x[row, step][wrong[row, step]].flatten()[0].item(), ".".join(path_of(key))
     raise UserError(
         f"'{name}' of environment {row} is {found:g} at step {step} of the rollout: the update would turn every "
         "weight into NaN; mend the environment, or clip it in a wrapper (gymnasium.wrappers.TransformObservation)"
@@ -257,13 +257,9 @@ def _specs(spec: Any) -> list[tuple[Any, Any]]:
     return [(key, spec[key]) for key in spec.keys(True, True)]
 
 
-def _path(key: Any) -> tuple[str, ...]:
-    return (key,) if isinstance(key, str) else key
-
-
 def _total(key: Any) -> tuple[str, ...]:
     """The name of the running sum of a reward."""
-    return (*_path(key)[:-1], f"episode_{_path(key)[-1]}")
+    return (*path_of(key)[:-1], f"episode_{path_of(key)[-1]}")
 
 
 def _padded(spec: Any, rows: int) -> Any:

@@ -55,6 +55,8 @@ class TorchRLCollector:
         state = memory(actor, one.batch_size.numel())
         if state and not one.batch_size:
             raise UserError("a recurrent actor reads a batch of environments, this is one: SerialEnv(1, make_env)")
+        if makers:
+            one.close()  # it was made for its specs
         primers = {key: Unbounded(x.shape[1:]) for key, x in state.items() if key != "is_init"}
         made: Any = [partial(_transformed, make, primers) for make in makers]
         self.frames, self.total_frames, self.compile_seconds = 0, total_frames, 0.0
@@ -63,7 +65,6 @@ class TorchRLCollector:
         if self._on_ray:
             if not makers:
                 raise UserError('backend="ray" takes a list of functions, one for each actor: [make_env, make_env]')
-            one.close()
             connect(cpus=len(made))
             given = kwargs.get("backend_options", {})
             kwargs |= {"sync": kwargs.get("sync", True), "num_collectors": len(made)}

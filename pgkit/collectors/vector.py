@@ -112,9 +112,10 @@ class VectorCollector:
     def state_dict(self) -> dict[str, Any]:
         """Counters, and the state of every environment and of the policy's memory.
 
-        After a rollout that failed, the environments have none: they begin new episodes.
+        After a rollout that failed, or :meth:`shutdown`, the environments have none: they begin new episodes.
         """
-        if self._workers is not None and not self._workers.is_open:
+        closed = self._share is None and self._rollouts > 0 if self._workers is None else not self._workers.is_open
+        if closed:
             shares = [lost(self._rollouts * self._steps)]
         else:
             shares = self._pool().state_dict() if self._pooled else [self._alone().state_dict()]
@@ -192,5 +193,6 @@ def say_resume(env: VectorEnv, share: dict[str, Any]) -> None:
     exact = "every environment goes on where it was"
     if is_lost or env.resume != "exact":
         exact = "every environment begins anew"
-    why = ": the run before it ended in the middle of a rollout" if is_lost and env.resume == "exact" else ""
+    amid = ": the run before it ended in the middle of a rollout, or after the collector's shutdown()"
+    why = amid if is_lost and env.resume == "exact" else ""
     getLogger("pgkit").info("the resumed run: %s%s (%s)", exact, why, env.env_id)

@@ -80,6 +80,7 @@ class Gymnasium:
         self.seed = seed
         self._totals.forget(np.ones(self.num_envs, bool))
         self._begun = np.zeros(self.num_envs, bool)  # the episode was begun and has not been stepped since
+        self._seeds: list[int | None] = [None] * self.num_envs  # of the running episodes
         self._seeded = np.zeros(self.num_envs, bool)
         self._episode = np.full(self.num_envs, -1)
         self._taken: list[np.ndarray] = []  # actions [N, ...] of the last steps
@@ -99,6 +100,7 @@ class Gymnasium:
         self._episode[i] += 1
         seeds = self.reseed or not self._seeded[i]
         seed = episode_seed(self.seed, self.first + i, int(self._episode[i])) if seeds else None
+        self._seeds[i] = seed
         try:
             obs = checked_reset(self.envs[i], seed, self.options)
         except FAILURES as error:
@@ -125,9 +127,8 @@ class Gymnasium:
         self._forget()
 
     def _fail(self, i: int, error: BaseException) -> NoReturn:
-        seed = episode_seed(self.seed, self.first + i, int(self._episode[i]))
         step = int(self._totals.step_count[i]) + 1
-        fail(in_episode(self.envs[i].unwrapped, self.first + i, step, seed), error)
+        fail(in_episode(self.envs[i].unwrapped, self.first + i, step, self._seeds[i]), error)
 
     def _write(self, i: int, obs: Any, method: str) -> None:
         try:

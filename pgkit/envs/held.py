@@ -28,11 +28,14 @@ def walk(owner: Any, own: set[str], path: str = "", seen: set[int] | None = None
 
 
 def put(slot: Slot, value: Any) -> None:
-    """Gives a slot another value; a tensor keeps its memory, which others may share."""
+    """Gives a slot another value; a tensor keeps its device, and its memory, which others may share."""
     _, holder, name, now = slot
-    if isinstance(now, Tensor) and isinstance(value, Tensor) and now.shape == value.shape and _is_dense(now):
-        now.copy_(value)
-    elif isinstance(holder, dict | list):
+    if isinstance(now, Tensor) and isinstance(value, Tensor):
+        value = value.to(now.device)
+        if now.shape == value.shape and _is_dense(now):
+            now.copy_(value)
+            return
+    if isinstance(holder, dict | list):
         holder[name] = value
     else:
         vars(holder)[name] = value

@@ -223,8 +223,10 @@ def _share(function: Callable[..., Any], settings: Settings, first: int, count: 
                 f"the function made {simulator.num_envs} environments where num_envs={count}: let it take num_envs"
             )
         return simulator
+    apart = {"info=": bool(settings.info), "flatten=False": not settings.flatten}
     if isinstance(made, Simulator):
-        _only_for_single(settings, made)
+        resets = {"reseed=False": not settings.reseed, "reset_options=": settings.reset_options is not None}
+        _only_for_single(settings, made, apart | resets)
         return made
     refuse_turns(made)
     if settings.compile == "on":
@@ -236,7 +238,7 @@ def _share(function: Callable[..., Any], settings: Settings, first: int, count: 
         given["seed"] = episode_seed(seed, i, 0)
         rest.append(function(**{name: given[name] for name in names & given.keys()}))
     if is_parallel(made):
-        _only_for_single(settings, made)
+        _only_for_single(settings, made, apart)
         return Parallel([made, *rest], seed, first, settings.groups, settings.reseed, settings.reset_options)
     if settings.groups is not None:
         raise UserError(f"groups= is for environments with many agents, {type(made).__name__} has one: leave it out")
@@ -257,32 +259,26 @@ def _named(function: Any) -> set[str]:
         return set()
 
 
-def _only_for_single(settings: Settings, env: Any) -> None:
-    """A ``UserError`` for a setting that environments with many agents do not have."""
+def _only_for_single(settings: Settings, env: Any, also: Mapping[str, bool], instead: str = "leave it out") -> None:
+    """A ``UserError`` for a setting that single Gymnasium environments have, and this one does not.
+
+    Args:
+        also: further settings, and whether they are given.
+        instead: what to do.
+    """
     given = {
         "action_repeat=": settings.action_repeat > 1, "max_episode_steps=": settings.time_limit is not None,
-        "info=": bool(settings.info), "flatten=False": not settings.flatten,
+        "pixels=": settings.pixels is not None, "frame_stack=": settings.frame_stack > 1,
+        "reward_clipping=": settings.reward_clipping, **also,
     }  # fmt: skip
     if named := [name for name, is_given in given.items() if is_given]:
-        raise UserError(
-            f"{named[0]} is for single Gymnasium environments, this is a {type(env).__name__}: leave it out"
-        )
+        raise UserError(f"{named[0]} is for single Gymnasium environments, this is a {type(env).__name__}: {instead}")
 
 
 def _simulator(env: EnvBase | GymVectorEnv, seed: int, first: int, settings: Settings) -> Simulator:
-    single = {
-        "action_repeat": settings.action_repeat > 1,
-        "max_episode_steps": settings.time_limit is not None,
-        "pixels": settings.pixels is not None,
-        "frame_stack": settings.frame_stack > 1,
-        "reward_clipping": settings.reward_clipping,
-        "reset_options": settings.reset_options is not None and isinstance(env, EnvBase),
-    }
-    if what := [name for name, given in single.items() if given]:
-        raise UserError(
-            f"{what[0]}= is for single Gymnasium environments, this is a {type(env).__name__}: use one of its "
-            "library's wrappers (TorchRL: StepCounter(max_steps=...), FrameSkipTransform(...))"
-        )
+    wrappers = "use one of its library's wrappers (TorchRL: StepCounter(max_steps=...), FrameSkipTransform(...))"
+    options = settings.reset_options is not None and isinstance(env, EnvBase)
+    _only_for_single(settings, env, {"reset_options=": options}, wrappers)
     if not settings.reseed:
         raise UserError(f"reseed=False: {type(env).__name__} is seeded once anyway: leave it out")
     warn_of_statistics(env)

@@ -111,6 +111,7 @@ class Parallel:
     def _restart(self, seed: int) -> None:
         self.seed = seed
         self._begun = np.zeros(self.num_envs, bool)  # the episode was begun and has not been stepped since
+        self._seeds: list[int | None] = [None] * self.num_envs  # of the running episodes
         self._seeded = np.zeros(self.num_envs, bool)
         self._episode = np.full(self.num_envs, -1)
         self._taken: list[list[list[np.ndarray]]] = [[] for _ in self.envs]  # actions of the running episodes
@@ -131,10 +132,11 @@ class Parallel:
         if self.reseed or not self._seeded[i]:
             given["seed"] = episode_seed(self.seed, self.first + i, int(self._episode[i]))
             self._seeded[i] = True
+        self._seeds[i] = given.get("seed")
         try:
             result = self.envs[i].reset(**given)
         except FAILURES as error:
-            fail(in_episode(self.envs[i], self.first + i, 0, given.get("seed")), error)
+            fail(in_episode(self.envs[i], self.first + i, 0, self._seeds[i]), error)
         if not isinstance(result, tuple) or len(result) != 2 or not isinstance(result[0], dict):
             raise UserError(
                 f"{type(self.envs[i]).__name__}.reset returned a {type(result).__name__}: return (observations, "
@@ -182,8 +184,7 @@ class Parallel:
         try:
             result = env.step(given)
         except FAILURES as error:
-            seed = episode_seed(self.seed, self.first + i, int(self._episode[i]))
-            fail(in_episode(env, self.first + i, int(self._steps[i]) + 1, seed), error)
+            fail(in_episode(env, self.first + i, int(self._steps[i]) + 1, self._seeds[i]), error)
         if not isinstance(result, tuple) or len(result) != 5:
             raise UserError(
                 f"{type(env).__name__}.step returned no tuple of 5: return (observations, rewards, terminations, "

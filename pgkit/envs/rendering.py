@@ -98,9 +98,10 @@ def _drawn_by_mujoco(inner: Any, size: int, fast: bool) -> Callable[[], np.ndarr
     def draw() -> np.ndarray:
         physics = inner._env.physics
         if not made or made[0].model is not physics.model.ptr:
+            for before in made:
+                before.free()
             _lighten(physics.model.ptr, size, fast)
             made[:] = [MuJoCo(physics.model.ptr, size, inner.render_kwargs.get("camera_id", 0))]
-            atexit.register(made[0].context.free)  # before MuJoCo ends EGL itself
         return made[0](physics.data.ptr)
 
     return draw
@@ -127,6 +128,14 @@ class MuJoCo:
         self.into = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self.into)
         self.out = np.empty((size, size, 3), np.uint8)
+        atexit.register(self.free)  # before MuJoCo ends EGL itself
+
+    def free(self) -> None:
+        """Gives back the memory that it draws in."""
+        atexit.unregister(self.free)
+        self.context.make_current()
+        self.into.free()
+        self.context.free()
 
     def __call__(self, data: Any) -> np.ndarray:
         mujoco, everything = self.mujoco, self.mujoco.mjtCatBit.mjCAT_ALL

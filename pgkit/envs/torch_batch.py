@@ -219,7 +219,9 @@ class Torch:
             env.load_state_dict(own)
         if exact and state["data"] is not None:
             self._data = TensorDict(state["data"], batch_size=self.env.batch_size, device=self.env.device)
-            self.episode_reward, self.step_count, self._begun = state["counts"]
+            returns, *counts = state["counts"]
+            self.episode_reward = {key: x.to(self.device) for key, x in returns.items()}
+            self.step_count, self._begun = (x.to(self.device) for x in counts)
             return self._entries(self._data, self.observation_spec)
         return self.reset()
 

@@ -290,7 +290,8 @@ class Vmas:
         self._stream.state[:] = state["random"]
         self._steps = state["steps"]
         self.step_count, self._begun = (state["counts"][name].to(self.device) for name in ("step_count", "begun"))
-        self.episode_reward = dict(zip(self.episode_reward, state["returns"], strict=True))
+        returns = [x.to(self.device) for x in state["returns"]]
+        self.episode_reward = dict(zip(self.episode_reward, returns, strict=True))
         with self._stream:
             self._fresh = self._named(self.see())
         return self._fresh

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import typing
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -96,6 +97,33 @@ def set_numbers(module: nn.Module, saved: dict[str, Any]) -> None:
         if now[name] != saved[name]:
             path, _, attribute = name.rpartition(".")
             setattr(module.get_submodule(path), attribute, saved[name])
+
+
+@contextlib.contextmanager
+def as_built(agent: Agent) -> Iterator[None]:
+    """A state that is loaded in this block brings what was learned; the agent's settings stay as they were built.
+
+    Those are the buffers that loss, estimator, explorer and controller hold besides networks, normalizers and scales
+    (coefficients, sizes of noise), and the actor's plain numbers.
+    """
+    learned = {id(x) for owner in (agent.actor, agent.critic, agent.normalizer, agent.scale) for x in _modules(owner)}
+    owners = (agent.loss, agent.advantage, agent.explorer, agent.controller)
+    others = [part for owner in owners for part in _modules(owner) if id(part) not in learned]
+    buffers = [(x, x.clone()) for part in others if not _is_layer(part) for x in part.buffers(recurse=False)]
+    plain = numbers(agent.actor)
+    yield
+    for x, value in buffers:
+        x.copy_(value)
+    set_numbers(agent.actor, plain)
+
+
+def _modules(owner: Any) -> list[nn.Module]:
+    return list(owner.modules()) if isinstance(owner, nn.Module) else []
+
+
+def _is_layer(part: nn.Module) -> bool:
+    """Whether it is torch's own, or TensorDict's: the networks of a loss, and their targets."""
+    return type(part).__module__.partition(".")[0] in ("torch", "tensordict")
 
 
 def rebuild(run_dir: Path, make: Callable[..., Agent] | None, trust: bool) -> tuple[Agent, RunArgs, Any]:

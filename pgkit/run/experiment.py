@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import hashlib
+import io
 import itertools
 import json
 import re
@@ -16,6 +17,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from pgkit import files
 from pgkit.errors import UserError
 from pgkit.run.config import read_config, read_json
 from pgkit.run.metrics import column, read_csv
@@ -151,12 +153,12 @@ def write(table: Path, finished: Sequence[Cell]) -> None:
         keys = {_key(r) for r in new}
         rows = [r for r in read(path, columns) if _key(r) not in keys] + new
         path.parent.mkdir(parents=True, exist_ok=True)
-        fresh = path.with_name(f".{path.name}.{time.time_ns()}")
-        with fresh.open("x", newline="") as file:
-            writer = csv.DictWriter(file, columns, lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(sorted(rows, key=lambda r: (*_key(r)[:3], int(r["seed"]), int(r["frames"]))))
-        fresh.replace(path)
+        lines = io.StringIO(newline="")
+        writer = csv.DictWriter(lines, columns, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(sorted(rows, key=lambda r: (*_key(r)[:3], int(r["seed"]), int(r["frames"]))))
+        with files.replacing(path) as file:
+            file.write(lines.getvalue().encode())
 
 
 def read(table: Path, columns: Sequence[str] = COLUMNS) -> list[dict[str, str]]:

@@ -59,8 +59,15 @@ def collector(
         overlap: the next rollout is collected beside the update.
         asynchronous: as ``overlap``, and each process delivers by itself.
         lag: with ``asynchronous``, ``max_lag`` and ``delay`` of :class:`~pgkit.collectors.AsyncCollector`.
+
+    Raises:
+        UserError: settings that exclude each other.
     """
     sizes: Any = {"frames_per_batch": frames_per_batch, "total_frames": args.total_frames, "compile": args.compile}
+    if asynchronous and args.learners > 1:
+        raise UserError(
+            f"--learners {args.learners}: processes at their own pace feed one learner; leave it out (or ppo)"
+        )
     if args.ray and overlap:
         raise UserError("--overlap: not with --ray, whose actors wait for the update; leave one of the two out")
     if args.ray:

@@ -22,7 +22,7 @@ from pgkit.compiled import chosen, set_matmul
 from pgkit.envs import vector_of
 from pgkit.errors import Diverged, UserError
 from pgkit.run import checkpoint, config, directory, ending, seeding
-from pgkit.run.agent import Agent
+from pgkit.run.agent import Agent, as_built
 from pgkit.run.args import RunArgs, check
 from pgkit.run.clock import Clock
 from pgkit.run.evaluate import evaluate
@@ -174,7 +174,9 @@ class Run:
         elif self.args.init:
             folder = self.args.init / "checkpoints"
             path = folder / ("best.pt" if (folder / "best.pt").exists() else "latest.pt")
-            checkpoint.restore({"agent": self._agent}, {"agent": checkpoint.load(path)["states"].get("agent")}, path)
+            begun_with = {"agent": checkpoint.load(path)["states"].get("agent")}
+            with as_built(self._agent):
+                checkpoint.restore({"agent": self._agent}, begun_with, path)
         if not self._saved:
             self._lock = directory.claim(self.dir, self.args, self.recipe)
             self._claimed = True
@@ -377,6 +379,7 @@ class Run:
         _log.warning("the run ends at an error; %s has %s%s", self.dir, where, f" ({why})" if why else "")
 
     def _finish(self) -> None:
+        is_saved = self._saved_at == self.frames
         if self._evaluated.get("frames") != self.frames:
             try:
                 scores = self._evaluate({})
@@ -384,7 +387,8 @@ class Run:
                 self.save()
                 raise
             self._metrics.write({"frames": self.frames, "time/wall_s": self._clock.wall, **scores})
-        if self._saved_at != self.frames:
+            is_saved = False  # the checkpoint knows the rows, and the best policy
+        if not is_saved:
             self.save()
         plot([self.dir], self.dir / "curve.png")
         ending.write_summary(self.dir, self.args, self.recipe, self._clock.wall, self._evaluated, self.best)  # the last

@@ -1,6 +1,6 @@
 """Statistics of a few runs, by the definitions of Agarwal et al. (2021), https://arxiv.org/abs/2108.13264.
 
-Scores are arrays ``[runs, tasks]``. The interval of a statistic comes from a stratified bootstrap: each task's runs are
+Scores come by task, several runs of each. Statistics have intervals from a stratified bootstrap: each task's runs are
 drawn anew, with replacement, and the 2.5th and 97.5th percentiles of the statistic bound it.
 """
 

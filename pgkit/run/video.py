@@ -39,7 +39,7 @@ def record(policy: Policy, file: Path, episodes: int, seed: int = 0) -> tuple[di
     if policy.args is None:
         raise UserError("a video is made of a run's policy: run.load_policy(RUN_DIR)")
     drawn = {} if policy.args.env_id.startswith("vmas/") else {"render_mode": "rgb_array"}
-    shown = dataclasses.replace(policy.args, env={**policy.args.env, **drawn})
+    shown = dataclasses.replace(policy.args, env={**policy.args.env, **drawn}, env_timeout=None)
     env = shown.make_env(num_envs=1, seed=seed)
     simulator: Any = env.simulator
     try:

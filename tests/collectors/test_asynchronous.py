@@ -1,5 +1,7 @@
 """Collecting beside the update: the same numbers as in turn, with weights one update old; lag bounded and counted."""
 
+import gymnasium as gym
+import numpy as np
 import pytest
 import torch
 
@@ -136,6 +138,34 @@ def test_a_checkpoint_in_between_changes_nothing(per_worker):
         straight.append(torch.stack(out))
         collector.shutdown()
     assert equal(*straight)
+
+
+def test_a_run_goes_on_after_a_rollout_that_could_not_be_handed_out():
+    class Breaks(gym.Env):
+        """Its seventh observation is NaN."""
+
+        observation_space, action_space, steps = gym.spaces.Box(0, 100, (1,)), gym.spaces.Box(-1, 1, (1,)), 0
+
+        def reset(self, *, seed=None, options=None):
+            return np.zeros(1, np.float32), {}
+
+        def step(self, action):
+            self.steps += 1
+            return np.float32([np.nan if self.steps == 7 else self.steps]), 0.0, False, False, {}
+
+    env = envs.make(Breaks)
+    actor = modules.gaussian_actor(env)
+    collector = collectors.AsyncCollector(env, actor, frames_per_batch=4, compile="off")
+    collector.rollout()
+    with pytest.raises(UserError, match=r"'next.observation' of environment 0 is nan at step 2"):
+        collector.rollout()
+    state = collector.state_dict()
+    assert collector.rollout()["next", "observation"].flatten().tolist() == [9, 10, 11, 12]
+    collector.shutdown()
+    collector = collectors.AsyncCollector(env, actor, frames_per_batch=4, compile="off")
+    collector.load_state_dict(state)
+    assert collector.rollout()["next", "observation"].flatten().tolist() == [9, 10, 11, 12]
+    collector.shutdown()
 
 
 def test_random_frames_come_first():

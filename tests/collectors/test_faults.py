@@ -71,6 +71,26 @@ def test_an_error_names_the_environment_its_step_and_its_seed(workers: int, deed
     again.shutdown()
 
 
+def test_an_environment_that_is_seeded_once_fails_in_an_episode_without_a_seed():
+    class Third(gym.Env):
+        """Its first episode has two steps; the next step fails."""
+
+        observation_space, action_space, steps = gym.spaces.Box(-1, 1, (1,)), gym.spaces.Discrete(2), 0
+
+        def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+            return np.zeros(1, np.float32), {}
+
+        def step(self, action: Any) -> Any:
+            self.steps += 1
+            assert self.steps < 3, "no more"
+            return np.zeros(1, np.float32), 0.0, self.steps == 2, False, {}
+
+    env = envs.make(Third, reseed=False)
+    collector = collectors.VectorCollector(env, modules.categorical_actor(env), frames_per_batch=4, compile="off")
+    with pytest.raises(EnvironmentFailed, match=r"step 1 of the episode of reset\(seed=None\)"):
+        collector.rollout()
+
+
 def test_a_vector_that_fails_names_what_it_knows():
     env = envs.make(lambda: gym.make_vec("CartPole-v1", num_envs=3), 3, seed=1)
     env.simulator.env.step = lambda actions: 1 / 0
@@ -273,3 +293,8 @@ def test_too_few_files_for_workers_is_one_line(spare: int):
             collector.rollout()
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+
+
+def test_an_address_of_a_cluster_that_is_none_is_one_line():
+    with pytest.raises(UserError, match="--ray-address nonsense: give auto, HOST:6379"):
+        collectors.connect("nonsense")

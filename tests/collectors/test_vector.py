@@ -202,6 +202,19 @@ def test_torchrl_collector_gives_the_same_seam():
     assert torch.equal(rollouts[0]["next", "episode_reward"][done], lengths.float())
 
 
+def test_the_environment_that_torchrl_s_collector_is_checked_with_is_closed(monkeypatch):
+    made = []
+
+    def maker():
+        made.append(GymEnv("Pendulum-v1"))
+        return made[-1]
+
+    monkeypatch.setattr("torchrl.collectors.Collector", lambda *args, **kwargs: None)
+    actor = modules.deterministic_actor(envs.make("Pendulum-v1"))
+    collectors.TorchRLCollector([maker, maker], actor, frames_per_batch=10)
+    assert [env.is_closed for env in made] == [True]
+
+
 def test_torchrl_environments_that_do_not_fit_are_named():
     env = GymEnv("InvertedPendulum-v5")  # its observations are float64
     actor = modules.gaussian_actor(env)
@@ -305,6 +318,33 @@ def test_a_state_taken_before_the_first_rollout_is_restored(workers):
     other.load_state_dict(state)
     assert equal(other.rollout(), expected)
     other.shutdown()
+
+
+@pytest.mark.parametrize(
+    ("kind", "workers"),
+    [(collectors.VectorCollector, 1), (collectors.VectorCollector, 2), (collectors.AsyncCollector, 1)],
+)
+def test_a_state_taken_after_the_shutdown_begins_new_episodes(kind, workers):
+    """A run saves after ``break`` and ``shutdown()``."""
+    seen = []
+    env = envs.make("CartPole-v1", num_envs=2, seed=3, workers=workers)
+    state = None
+    for _ in range(2):
+        collector = kind(env, modules.categorical_actor(env), frames_per_batch=20, compile="off")
+        if state is not None:
+            collector.load_state_dict(state)
+        seen.append(collector.rollout()["observation"][:, 0])
+        collector.shutdown()
+        state = collector.state_dict()
+    assert collector.frames == 40 and not torch.equal(*seen)
+
+
+def test_an_actor_writes_whole_numbers_too_and_a_random_one_zeros():
+    env = envs.make("Pendulum-v1", num_envs=2)
+    skill = TensorDictModule(lambda x: (x[:, :1] > -2).long(), in_keys=["observation"], out_keys=["skill"])
+    actor = TensorDictSequential(skill, modules.deterministic_actor(env))
+    collector = collectors.VectorCollector(env, actor, frames_per_batch=4, init_random_frames=4, compile="off")
+    assert [collector.rollout()["skill"].unique().tolist() for _ in range(2)] == [[0], [1]]
 
 
 def test_noise_that_is_kept_in_the_tensordict_is_refused():

@@ -243,6 +243,8 @@ class Mixed(Unlike):
         (Fading, {"groups": {"a": ["walker_0", "me"]}}, "Fading has no agent 'me', only walker_0, walker_1"),
         (Fading, {"groups": {"next": ["walker_0", "walker_1"]}}, "the group 'next' has a name that rollouts use"),
         (Fading, {"action_repeat": 2}, "action_repeat= is for single Gymnasium environments, this is a Fading"),
+        (Fading, {"frame_stack": 4}, "frame_stack= is for single Gymnasium environments, this is a Fading"),
+        ("vmas/balance", {"reseed": False}, "reseed=False is for single Gymnasium environments, this is a Vmas"),
         ("CartPole-v1", {"groups": {"a": ["b"]}}, "groups= is for environments with many agents"),
         ("vmas/balanse", {}, "unknown environment id 'vmas/balanse'; the nearest names are vmas/balance"),
         ("vmas/balance", {"max_steps": 5}, "max_episode_steps= cuts them off"),

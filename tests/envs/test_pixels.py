@@ -1,5 +1,6 @@
 """Rendered and stacked observations, and Atari: shapes, types, values, and what is said where they cannot be."""
 
+import importlib
 import logging
 import sys
 
@@ -79,6 +80,24 @@ def test_mujoco_is_drawn_as_dm_control_draws_it_and_the_choice_is_said_once(capl
     np.testing.assert_array_equal(newest, physics.render(84, 84, camera_id=0))
     again = envs.make(CARTPOLE, pixels=84, frame_stack=3, action_repeat=4).reset()["observation"]
     torch.testing.assert_close(again[0], rollout["observation"][0, 0])
+
+
+def test_a_new_model_is_drawn_by_a_new_renderer_and_the_old_one_is_given_back(monkeypatch):
+    """dm_control's composer makes a model for every episode."""
+    made = []
+
+    class Kept(rendering.MuJoCo):
+        def __init__(self, *args):
+            super().__init__(*args)
+            made.append(self)
+
+    monkeypatch.setattr(rendering, "MuJoCo", Kept)
+    env = envs.make(CARTPOLE, pixels=16).simulator.envs[0]
+    cartpole = importlib.import_module("dm_control.suite.cartpole")  # MUJOCO_GL is chosen by now
+    env.reset(seed=0)
+    env.unwrapped._env.physics.reload_from_xml_string(*cartpole.get_model_and_assets())
+    assert env.picture().shape == (3, 16, 16)
+    assert [renderer.context._context is None for renderer in made] == [True, False]
 
 
 def test_a_fast_picture_is_another_one_and_the_physics_are_the_same():

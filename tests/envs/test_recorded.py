@@ -44,6 +44,8 @@ class Hits(BaseScenario):
             self.hits[over] += 1
             speed[over] *= 0.5
         self.calls += self.kind == "counts"
+        if self.kind == "forgets" and agent is self.world.agents[0]:  # a tensor in every other step, else a number
+            self.last = 0 if isinstance(vars(self).get("last"), Tensor) else self.hits.sum()
         return self.hits + (float(self.hits.sum()) if self.kind == "reads" else 0.0)
 
     def observation(self, agent: Agent) -> Tensor:
@@ -93,7 +95,10 @@ def test_a_recorded_simulator_resumes_exactly():
     assert same(steps(one, 9, 4), steps(other, 9, 4))
 
 
-@pytest.mark.parametrize(("kind", "why"), [("counts", "the number 'scenario.calls'"), ("reads", "reads a number")])
+@pytest.mark.parametrize(
+    ("kind", "why"),
+    [("counts", "the number 'scenario.calls'"), ("reads", "reads a number"), ("forgets", "'scenario.last'")],
+)
 def test_what_no_record_holds_runs_as_it_is_and_the_log_says_why(kind: str, why: str, caplog: pytest.LogCaptureFixture):
     caplog.set_level("INFO", logger="pgkit")
     scenario = type("Own", (Hits,), {"kind": kind})

@@ -109,12 +109,13 @@ def test_a_trained_run_is_loaded_evaluated_and_begun_with(tmp_path: Path):
         assert torch.equal(mine, theirs)
     saved = files.load(tmp_path / "r" / "checkpoints" / "latest.pt")["states"]
     assert torch.equal(agent.loss.state_dict()["gamma"], saved["update"]["loss"]["gamma"])
+    others = ["--gamma", 0.5, "--exploration-noise", 0.25]  # settings are the new run's
     tuned = ["--total-frames", 112, "--updates-per-step", 0, "--init", tmp_path / "r", "--run-dir", tmp_path / "tuned"]
-    pgkit("run", "td3", *flags, *small, *tuned)  # nothing is trained
-    for mine, theirs in zip(
-        run.load_agent(tmp_path / "tuned").loss.state_dict().values(), agent.loss.state_dict().values(), strict=True
-    ):
-        assert not torch.is_tensor(mine) or torch.equal(mine, theirs)
+    pgkit("run", "td3", *flags, *small, *others, *tuned)  # nothing is trained
+    begun, learned = run.load_agent(tmp_path / "tuned"), agent.loss.state_dict()
+    assert begun.explorer.std == 0.25 and agent.explorer.std == pytest.approx(0.1)
+    for name, mine in begun.loss.state_dict().items():
+        assert not torch.is_tensor(mine) or torch.equal(mine, torch.tensor(0.5) if name == "gamma" else learned[name])
     done = pgkit("run", "ddpg", *flags, *small, *tuned[:-1], tmp_path / "other", ok=False)
     assert done.returncode == 2 and "the state of agent does not fit" in done.stderr
     assert not (tmp_path / "other").exists()

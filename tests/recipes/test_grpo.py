@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 
 import pytest
 import torch
@@ -32,9 +33,9 @@ def train(run_dir, *argv, frames=96):
 
 
 def test_same_seed_same_metrics_and_a_resumed_run_equals_the_straight_one(tmp_path):
-    train(tmp_path / "a", "--task", "sorting")
+    train(tmp_path / "a", "--task", "sorting", frames=128)  # greedy actions are tried at 64 and 128
     train(tmp_path / "b", "--task", "sorting", frames=64)
-    pgkit("run", "grpo", "--resume", tmp_path / "b", "--total-frames", 96)
+    pgkit("run", "grpo", "--resume", tmp_path / "b", "--total-frames", 128)
     assert rows(tmp_path / "a") == rows(tmp_path / "b")
     summary = json.loads((tmp_path / "a" / "summary.json").read_text())
     assert 0 <= summary["eval/mean_reward"] <= 1 and summary["env_id"] == "sorting"
@@ -57,6 +58,16 @@ def test_same_seed_same_metrics_and_a_resumed_run_equals_the_straight_one(tmp_pa
 def test_variants(tmp_path, flags):
     train(tmp_path / "a", *flags, "--warm-start", 0)
     assert len(rows(tmp_path / "a")) == 3
+
+
+def test_a_fine_tuned_run_keeps_its_reference_on_a_resume_also_where_what_it_began_with_is_gone(tmp_path):
+    train(tmp_path / "first", "--warm-start", 0, frames=32)
+    begun = ("--init", tmp_path / "first", "--kl-coeff", 1.0, "--entropy-coeff", 1.0, "--no-drop")  # entropy moves it
+    train(tmp_path / "a", *begun)
+    train(tmp_path / "b", *begun, frames=64)
+    shutil.rmtree(tmp_path / "first")
+    pgkit("run", "grpo", "--resume", tmp_path / "b", "--total-frames", 96)
+    assert rows(tmp_path / "a") == rows(tmp_path / "b")
 
 
 def test_mistakes_are_one_line(tmp_path):

@@ -58,6 +58,12 @@ def test_runs_with_the_algorithm_s_other_half(tmp_path, recipe, flags):
     assert float(rows(tmp_path / "run")[-1]["frames"]) >= 256
 
 
+def test_one_learner_takes_what_processes_deliver_by_themselves(tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        train("impala", tmp_path / "run", *DISCRETE, "--ray", "--learners", 2, frames=256)
+    assert "--learners 2: processes at their own pace feed one learner" in capsys.readouterr().err
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("recipe", RECIPES)
 def test_solves_cartpole(tmp_path, recipe):

@@ -79,6 +79,7 @@ def test_runs_for_a_few_hundred_frames(tmp_path, flags):
         ),
         (("--total-frames", 10), "total_frames=10 is less than one rollout"),
         (("--overlap", "--collector", "torchrl"), "TorchRL's Collector waits for the update"),
+        (("--ray", "--collector", "torchrl"), "--ray: TorchRL's Collector waits for the update"),
         (("--num-envs", 2, "--workers", 3), "every worker needs at least one environment"),
     ],
 )

@@ -20,7 +20,7 @@ Row = dict[str, str]
 
 
 def arguments(path: Path, total: int = 40, **settings: Any) -> RunArgs:
-    return RunArgs(env_id="Fake/Count-v0", run_dir=path, total_frames=total, eval_every=20, **settings)
+    return RunArgs(env_id="Fake/Count-v0", run_dir=path, total_frames=total, **{"eval_every": 20, **settings})
 
 
 def rows(path: Path, timed: bool = False) -> list[Row]:
@@ -131,6 +131,23 @@ def test_ctrl_c_finishes_the_step_saves_and_can_be_resumed(
     assert signal.getsignal(number) is handler
     kit.train(arguments(tmp_path / "r", resume=tmp_path / "r"))
     assert rows(tmp_path / "r") == rows(tmp_path / "whole")
+
+
+def test_a_run_that_is_stopped_at_its_last_step_is_evaluated_by_a_resume_and_goes_on(
+    kit: SimpleNamespace, tmp_path: Path
+):
+    def interrupt(frames: int) -> None:
+        if frames == 30:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    path = tmp_path / "r"
+    with pytest.raises(KeyboardInterrupt):
+        kit.train(arguments(path, eval_every=0), hook=interrupt)
+    assert not list((path / "checkpoints").glob("best.pt"))
+    kit.train(arguments(path, eval_every=0, resume=path))
+    assert (path / "checkpoints" / "best.pt").exists() and len(rows(path)) == 5
+    kit.train(arguments(path, total=80, eval_every=0, resume=path))
+    assert len(rows(path)) == 9
 
 
 def test_a_failed_or_stopped_evaluation_costs_no_training(kit: SimpleNamespace, tmp_path: Path, monkeypatch: Any):

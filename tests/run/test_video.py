@@ -43,7 +43,7 @@ gym.register("tests/Clock-v0", Clock)
 
 @pytest.fixture
 def policy() -> run.Policy:
-    args = run.RunArgs(env_id="tests/Clock-v0")
+    args = run.RunArgs(env_id="tests/Clock-v0", env_timeout=60.0)
     env = args.make_env(1, 0)
     return run.Policy(modules.categorical_actor(env), args.make_env, **run.policy.describe_env(env), args=args)
 
