@@ -95,13 +95,13 @@ class DDPGLoss(QLoss):
 
         outputs = self.outputs(batch, batch[self.tensor_keys.action], self.qvalue_network_params)
         loss_value, q = self.regress(batch, outputs, target)
+        y = self.average(target.mean, batch)
 
         batch = self.first(batch)
         action = self.action(batch, self.actor_network_params)
         value = self.q(batch, action, self.qvalue_network_params.detach()).squeeze(-1)
 
         out = TensorDict({"loss_actor": self.reduce(-value, batch), "loss_value": loss_value})
-        q, y = q.detach(), target.mean
-        out["pred_value"], out["pred_value_max"] = q.mean(), q.max()
-        out["target_value"], out["target_value_max"] = y.mean(), y.max()
+        out["pred_value"], out["pred_value_max"] = q, self.head.mean(outputs).detach().max()
+        out["target_value"], out["target_value_max"] = y, target.mean.max()
         return out

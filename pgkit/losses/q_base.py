@@ -226,18 +226,19 @@ class QLoss(Loss):
         return cast(Value, target)
 
     def regress(self, batch: TensorDictBase, outputs: Tensor, target: Returns) -> tuple[Tensor, Tensor]:
-        """The loss of the critics' ``outputs [*B, critics, size]`` at the target, reduced, and their values.
+        """The loss of the critics' ``outputs [*B, critics, size]`` at the target, reduced, and their mean value.
 
         Writes the priority, and weighs each row by the importance weight of a prioritized replay.
 
         Returns:
-            The loss and ``[*B, critics]``.
+            The loss, and a metric ``[]``.
         """
         q = self.head.mean(outputs)
         self.write_priority(batch, q - target.mean.unsqueeze(-1))
         weight = batch.get(self.tensor_keys.priority_weight, None)
         loss = self.head.loss(outputs, target).sum(-1)
-        return self.reduce(loss if weight is None else loss * self.by_row(weight, batch), batch), q
+        loss = loss if weight is None else loss * self.by_row(weight, batch)
+        return self.reduce(loss, batch), self.average(q.mean(-1), batch)
 
     def by_row(self, entry: Tensor, batch: TensorDictBase) -> Tensor:
         """An entry without its trailing 1, ``[*B]``; of a group ``[*B, agents]``, or ``[*B, 1]`` of what all share."""
@@ -247,8 +248,9 @@ class QLoss(Loss):
         return masks_of(super()._loss_mask_keys(), self.tensor_keys.action, self.loss_mask_key)
 
     def write_priority(self, batch: TensorDictBase, td_error: Tensor) -> None:
-        """Writes the largest error of the critics, of agents too, in absolute value, into the batch."""
-        batch.set(self.tensor_keys.priority, td_error.detach().abs().flatten(batch.dim()).amax(-1))
+        """Writes the largest error of the critics, of agents too, in absolute value; 0 for what a mask leaves out."""
+        error = self._reduce_loss(td_error.detach().abs().amax(-1), batch, reduction="none")
+        batch.set(self.tensor_keys.priority, error.reshape(*batch.batch_size, -1).amax(-1))
 
     def first(self, batch: Any) -> Any:
         """What the actor learns on, of a batch or a tensor: all of it, of augmented copies the first."""

@@ -177,14 +177,14 @@ class SoftQLoss(QLoss):
             loss_actor, loss_qvalue: reduced.
             action: drawn there, ``[*B, actions]``.
             log_prob: its log-probability, ``[*B]``.
-            q: the critics' values of the batch's actions.
+            q: the mean of the critics' values of the batch's actions, ``[]``.
             out_of_reach: the part of the target entropy that is not asked of a row, ``[*B]``.
         """
         entropy = -log_prob.detach()
         missing = (self.seen_entropy(action, log_prob) if self._automatic else 0.0) - out_of_reach
         loss_alpha = self.reduce(self.temperature.loss(missing - entropy), batch)
         out = TensorDict({"loss_actor": loss_actor, "loss_qvalue": loss_qvalue, "loss_alpha": loss_alpha})
-        out["alpha"], out["entropy"], out["q_value"] = self.alpha, entropy.mean(), q.detach().mean()
+        out["alpha"], out["entropy"], out["q_value"] = self.alpha, self.average(entropy, batch), q
         return out
 
     def _writes(self) -> list[NestedKey]:

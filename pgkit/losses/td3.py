@@ -101,13 +101,14 @@ class TD3Loss(QLoss):
         outputs = self.outputs(batch, batch[self.tensor_keys.action], self.qvalue_network_params)
         loss_qvalue, q = self.regress(batch, outputs, target)
 
+        means = [self.average(x.mean, batch) for x in (min_q, target)]
         batch = self.first(batch)
         action = self.action(batch, self.actor_network_params)
         q1 = self.q(batch, action, self.qvalue_network_params.detach(), slice(1)).squeeze(-1)
 
         out = TensorDict({"loss_actor": self.reduce(-q1, batch), "loss_qvalue": loss_qvalue})
-        out["pred_value"], out["state_action_value_actor"] = q.detach().mean(), q1.detach().mean()
-        out["next_state_value"], out["target_value"] = min_q.mean.mean(), target.mean.mean()
+        out["pred_value"], out["state_action_value_actor"] = q, self.average(q1, batch)
+        out["next_state_value"], out["target_value"] = means
         return out
 
 
