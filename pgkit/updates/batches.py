@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
-from pgkit.checks import LossView, replay
+from pgkit.checks import LossView, device_of, replay
 from pgkit.data import RayReplay, ReplayBuffer
 from pgkit.errors import UserError
 
@@ -83,9 +83,9 @@ class TorchRLBatches:
     def draw(self, batches: int) -> Iterator[Draw]:
         for _ in range(batches):
             self._sample = self.buffer.sample(self.batch_size)
-            data = self._sample.select(*self.view.readable(self._sample))
-            self._batch = data.set(self.priority, torch.zeros(self.batch_size, device=data.device))
-            yield self._batch, torch.arange(self.batch_size, device=data.device)
+            data, device = self._sample.select(*self.view.readable(self._sample)), device_of(self._sample)
+            self._batch = data.set(self.priority, torch.zeros(self.batch_size, device=device))
+            yield self._batch, torch.arange(self.batch_size, device=device)
 
     def gather(self, data: TensorDictBase, index: Tensor) -> TensorDictBase:
         rows = data.exclude(self.priority)
