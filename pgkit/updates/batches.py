@@ -49,7 +49,7 @@ class OwnBatches:
                 f"the replay is prioritized, but {self.view.name} writes no '{self.priority}' into the "
                 "batch: write the absolute error [*B] there, or draw uniformly"
             )
-        errors = batch[self.priority].to(index.device)
+        errors = batch[self.priority].to(index.device).reshape(-1, len(index)).amax(0)  # of copies, the largest
         self.buffer.write_back(data, index, TensorDict({"td_error": errors}, errors.shape))
 
     def written(self) -> list[Tensor]:
