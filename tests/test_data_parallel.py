@@ -24,7 +24,7 @@ CASES = {  # of an update over 52 rows a learner: minibatches of 20, 20 and 12
     "rollout": dict(gae=dict(average_gae=True), normalize=False, masked=True, epochs=2),
     "accumulated": dict(accumulate=2, normalize=False),
     "masked minibatch": dict(masked=True),
-    "own": dict(normalize=False, normalize_advantage=True, minibatch_size=None),
+    "own": dict(normalize=False, normalize_advantage=True, minibatch_size=None, masked=True),
     "stopped": dict(target_kl=1e-6, epochs=8, lr=0.02),
     "compiled": dict(compile="on", epochs=2),
 }

@@ -91,6 +91,11 @@ class Advantage(TensorDictModuleBase):
         if group := _path(self._critic_value)[:-1]:
             self.tensor_keys = replace(self.tensor_keys, **_under(group))
 
+    def register_buffer(self, name: str, tensor: Tensor | None, persistent: bool = True) -> None:
+        """As in torch, on the critic's device: a CUDA graph takes nothing from another."""
+        device = next((p.device for p in self.parameters()), None)
+        super().register_buffer(name, tensor if tensor is None else tensor.to(device=device), persistent)
+
     def set_keys(self, **keys: Any) -> None:
         """As in TorchRL: other names for the entries of :attr:`tensor_keys`; of a list, the first that there is.
 

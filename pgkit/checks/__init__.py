@@ -4,6 +4,6 @@ from pgkit.checks.assembly import assembly
 from pgkit.checks.diagram import diagram
 from pgkit.checks.keys import is_loss
 from pgkit.checks.settings import check_settings
-from pgkit.checks.view import LossView, result_of
+from pgkit.checks.view import LossView, device_of, result_of
 
-__all__ = ["LossView", "assembly", "check_settings", "diagram", "is_loss", "result_of"]
+__all__ = ["LossView", "assembly", "check_settings", "device_of", "diagram", "is_loss", "result_of"]

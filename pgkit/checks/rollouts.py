@@ -9,7 +9,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from pgkit.checks.keys import following, is_next, last, show
-from pgkit.checks.view import LossView, shape_of
+from pgkit.checks.view import LossView, device_of, shape_of
 from pgkit.errors import UserError
 from pgkit.seams import Memory
 
@@ -31,7 +31,7 @@ def check_order(view: LossView, rollout: TensorDictBase) -> None:
     def rows(key: Any, start: int) -> Tensor:  # all steps but one, [*envs, steps - 1, features]
         return rollout[key].narrow(time, start, steps - 1).reshape(*envs, steps - 1, -1)
 
-    free = torch.zeros(*envs, steps - 1, dtype=torch.bool, device=rollout.device)
+    free = torch.zeros(*envs, steps - 1, dtype=torch.bool, device=device_of(rollout))
     for key in [key for key in present if is_next(key) and last(key) == "done"]:
         free |= rows(key, 0).any(-1)
     for key in present.intersection(view.masks):

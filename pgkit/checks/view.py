@@ -105,6 +105,15 @@ class LossView:
         named = [] if own in (None, "auto") else [own]
         return [("collector", "mask"), "shifted_valid", *named, *dict.fromkeys((*path, "mask") for path in groups)]
 
+    def counting(self, data: TensorDictBase, x: Tensor, key: Any) -> Tensor | None:
+        """Which elements of ``x [*B, ...]`` count, bool, by the masks at the root and in the group of ``key``.
+
+        None where there is no mask: all of them.
+        """
+        places = ((), ("collector",), group(key))
+        found = [data[mask] for mask in self.masks if group(mask) in places and mask in data.keys(True)]
+        return torch.stack([LossModule._expand_loss_mask(mask, x) for mask in found]).all(0) if found else None
+
     def reads(self) -> list[Any]:
         """The loss's ``in_keys``; of a loss without any, what its networks and a one-step target read."""
         if self.in_keys:
@@ -233,6 +242,11 @@ def setting(owner: Any, name: str) -> float | None:
     """A number that a block holds under a name, such as ``gamma``; None if it holds none."""
     value = getattr(owner, name, None)
     return None if value is None else float(value)
+
+
+def device_of(data: TensorDictBase) -> torch.device:
+    """Where the tensors are; a TensorDict need not say it."""
+    return data.device or next(iter(data.values(True, True))).device
 
 
 def shape_of(data: TensorDictBase) -> str:

@@ -27,7 +27,7 @@ def captured(
         held: what ``run`` changes: the warm-up is undone.
         inputs: an example.
     """
-    given = [x.clone() for x in inputs]
+    given = [_copy(x) for x in inputs]
     place: list[Tensor] = []
     replay: Any = None
     copies = False
@@ -37,11 +37,10 @@ def captured(
         leaves = leaves_of(data)
         moved = [x.data_ptr() for x in leaves] != [x.data_ptr() for x in place]
         if moved and replay is not None and copies:
-            for mine, its in zip(place, leaves, strict=True):
-                mine.copy_(its)
+            _fill([_memory(x) for x in place], leaves)
         elif moved or replay is None:
             copies = replay is not None
-            place = [x.clone() for x in leaves] if copies else leaves
+            place = [_copy(x) for x in leaves] if copies else leaves
             replay = _capture(run, place, held, given)
         return replay
 
@@ -49,19 +48,38 @@ def captured(
 
 
 def _capture(run: Run, leaves: Sequence[Tensor], held: Sequence[Tensor], given: Sequence[Tensor]) -> Run:
-    stream = torch.cuda.Stream()
-    stream.wait_stream(torch.cuda.current_stream())
-    with torch.cuda.stream(stream):
-        undone([*held, *leaves], lambda: [run(*leaves, *given) for _ in range(2)])
-    torch.cuda.current_stream().wait_stream(stream)
-    graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph):
-        results = run(*leaves, *given)
+    with torch.cuda.device([*held, *leaves, *given][0].device):  # whose streams these are
+        stream = torch.cuda.Stream()
+        stream.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(stream):
+            undone([*held, *leaves], lambda: [run(*leaves, *given) for _ in range(2)])
+        torch.cuda.current_stream().wait_stream(stream)
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph, capture_error_mode="thread_local"):  # other threads may use the device meanwhile
+            results = run(*leaves, *given)
+
+    places = [_memory(x) for x in given]
 
     def replay(*inputs: Tensor) -> list[Tensor]:
-        for mine, its in zip(given, inputs, strict=True):
-            mine.copy_(its)
+        _fill(places, inputs)
         graph.replay()
         return [x.clone() for x in results]  # the next replay writes to the same memory
 
     return replay
+
+
+def _copy(x: Tensor) -> Tensor:
+    """A copy with the strides of ``x``, which the code was made for: ``clone`` closes gaps."""
+    return _memory(x).clone().as_strided(x.shape, x.stride())
+
+
+def _memory(x: Tensor) -> Tensor:
+    """The memory from the first element to the last one, gaps included, as a vector."""
+    last = sum((size - 1) * stride for size, stride in zip(x.shape, x.stride(), strict=True))
+    return x.as_strided((last + 1 if x.numel() else 0,), (1,))
+
+
+def _fill(places: Sequence[Tensor], given: Sequence[Tensor]) -> None:
+    """Copies tensors into the memory of others of the same strides."""
+    for place, x in zip(places, given, strict=True):
+        place.copy_(x.as_strided(place.shape, (1,)))

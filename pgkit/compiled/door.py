@@ -158,7 +158,6 @@ class Compiled:
 
     def _climb(self, data: TensorDictBase | None, inputs: Sequence[Tensor]) -> Bind:
         """The function as the present rung runs it, which must repeat it on the other inputs."""
-        self._constants = None
         if self.rung == EAGER:
             return lambda data: partial(self.function, data)
         held = list({id(x): x for x in (*tensors_of(self.watch), *self.holds)}.values())

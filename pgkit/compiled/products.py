@@ -192,18 +192,19 @@ def as_they_are() -> Iterator[None]:
     """While it compiles, inductor calls oneDNN's operator as it is; its own lowering would copy the factors first."""
     from torch._inductor.lowering import lowerings, make_fallback
 
-    with suppress(AttributeError, RuntimeError):
+    try:
         linear = torch.ops.mkldnn._linear_pointwise.default
-        before = lowerings.pop(linear, None)
-        make_fallback(linear, warn=False, override_decomp=True)
-        try:
-            yield
-        finally:
-            lowerings.pop(linear, None)
-            if before is not None:
-                lowerings[linear] = before
+    except (AttributeError, RuntimeError):  # a torch without oneDNN, or whose operator has another name
+        yield
         return
-    yield
+    before = lowerings.pop(linear, None)
+    make_fallback(linear, warn=False, override_decomp=True)
+    try:
+        yield
+    finally:
+        lowerings.pop(linear, None)
+        if before is not None:
+            lowerings[linear] = before
 
 
 def cpu() -> str:

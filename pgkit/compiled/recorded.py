@@ -114,7 +114,9 @@ def recorded(
     tensors = [*recorder.held, *recorder.leaves(data), *inputs]
     elsewhere = [tuple(x.shape) for x in tensors if not x.is_cuda]
     if tensors and not elsewhere and not decisions:
-        return captured(graph, recorder.leaves, recorder.held, inputs)
+        launch = captured(graph, recorder.leaves, recorder.held, inputs)
+        launch(data)  # now: where it cannot be captured, the ladder has another rung
+        return launch
     if len(elsewhere) < len(tensors):
         why = "it decides on values" if decisions else f"a tensor of shape {elsewhere[0]} is not on the device"
         getLogger("pgkit").info("not one CUDA graph: %s", why)

@@ -27,7 +27,8 @@ class Recent:
         self._kept.appendleft(rollout.clone())
         while len(self._kept) < cast(int, self._kept.maxlen):
             self._kept.append(rollout.clone())
-        return cast(TensorDictBase, torch.cat(list(self._kept), 0))
+        device = next(iter(rollout.values(True, True))).device  # a checkpoint brings the others to the CPU
+        return cast(TensorDictBase, torch.cat([kept.to(device) for kept in self._kept], 0))
 
     def state_dict(self) -> dict[str, Any]:
         """The rollouts that are kept."""

@@ -19,6 +19,8 @@ from pgkit.data.table import Storage, Table
 from pgkit.errors import UserError, check_whole_number
 from pgkit.seams import Entries, Key
 
+MASK = ("collector", "mask")
+
 
 class ReplayBuffer:
     """The last ``capacity`` frames of ``env``, on TorchRL's storages.
@@ -87,6 +89,7 @@ class ReplayBuffer:
         )  # fmt: skip
         self.data = self.table.data
         self._errors: Tensor | None = None
+        self._ignored: Tensor | None = None  # rows that a mask leaves out, [rows] on the CPU, where rollouts have one
         if sampler is not None:
             self.data["weighting"] = sampler.begin(self.rows, self.device)
         self.generator = torch.Generator().manual_seed(int(torch.randint(2**62, ())) if seed is None else seed)
@@ -115,7 +118,7 @@ class ReplayBuffer:
         """Writes a rollout ``[num_envs, T]`` (or ``[num_envs]``: one step) with TorchRL's ``next`` entries.
 
         Where draws are prioritized, an entry ``td_error [num_envs, T]`` has the frames' first errors. Without one, they
-        get the largest priority so far.
+        get the largest priority so far. Frames that ``("collector", "mask")`` leaves out are never drawn.
 
         Rollouts need not continue one another: where an observation is not the one that the frame before led to,
         that frame keeps its own.
@@ -141,9 +144,23 @@ class ReplayBuffer:
             {key: now(key) for key in ("action", *self.entries)}
             | {key: after(key) for key in ("reward", "terminated", "done")},
         )
+        self._note_ignored(rollout)
         if self.sampler is not None:
             new = torch.arange(max(ready, self.start), self.start + len(self)) % self.rows
+            new = new if self._ignored is None else new[~self._ignored[new]]
             self.sampler.extend(new, torch.arange(oldest, self.start) % self.rows, self._first_errors(rollout, new))
+
+    def _note_ignored(self, rollout: TensorDictBase) -> None:
+        """Which of the newest rows a mask leaves out; the tensor is made for the first mask."""
+        mask = rollout.get(MASK, None)
+        if mask is None and self._ignored is None:
+            return
+        out = torch.zeros(rollout.numel(), dtype=torch.bool)
+        if mask is not None:
+            out = ~self._rows_of("rollout", rollout, MASK).flatten().cpu()
+        if self._ignored is None:
+            self._ignored = torch.zeros(self.rows, dtype=torch.bool)
+        self._ignored[torch.arange(self.written - len(out), self.written) % self.rows] = out
 
     def _first_errors(self, rollout: TensorDictBase, new: Tensor) -> Tensor | None:
         """The errors that the rows ``new`` came with: with n-step returns some are of the rollout before."""
@@ -160,7 +177,7 @@ class ReplayBuffer:
         x, dims = data.get(key, None), data.batch_dims
         if x is None:
             raise UserError(f"the {name} to store has no '{key}', only {', '.join(map(str, data.keys()))}")
-        x = x.to(self.device, non_blocking=True)
+        x = x.to(self.device, non_blocking=self.device.type != "cpu")  # the CPU would read it before it is there
         steps = data.batch_size.numel() // self.columns
         if steps == 1:
             return x.reshape(self.columns, *x.shape[dims:])
@@ -180,8 +197,14 @@ class ReplayBuffer:
             )
         if self.sampler is not None:
             return self.sampler.sample(batches, batch_size, self.generator)
-        index = torch.randint(len(self), (batches, batch_size), generator=self.generator)
-        return ((index + self.start) % self.rows).to(self.device)
+        return self._uniform(batches * batch_size).view(batches, batch_size).to(self.device)
+
+    def _uniform(self, count: int) -> Tensor:
+        """So many rows that count, each as likely as another; on the CPU."""
+        index = (torch.randint(len(self), (count,), generator=self.generator) + self.start) % self.rows
+        if self._ignored is not None and len(out := self._ignored[index].nonzero().squeeze(-1)):
+            index[out] = self._uniform(len(out))
+        return index
 
     def sample(self, batch_size: int, gamma: float | Tensor = 1.0) -> TensorDictBase:
         """A batch ``[batch_size]`` of transitions with TorchRL's keys; ``gamma`` counts where ``n_steps > 1``."""
@@ -201,6 +224,7 @@ class ReplayBuffer:
         if self.sampler is not None:
             self.sampler.extend(torch.arange(0), torch.arange(self.rows))
         self.table.clear()
+        self._ignored = None
 
     def state_dict(self) -> dict[str, Any]:
         """Everything stored, and the state of the draws."""
@@ -209,6 +233,7 @@ class ReplayBuffer:
             "table": self.table.state_dict(),
             "generator": self.generator.get_state(),
             "sampler": None if self.sampler is None else self.sampler.state_dict(),
+            "ignored": None if self._ignored is None else self._ignored.clone(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -225,6 +250,7 @@ class ReplayBuffer:
         self.generator.set_state(state["generator"])
         if self.sampler is not None:
             self.sampler.load_state_dict(state["sampler"])
+        self._ignored = state.get("ignored")  # an earlier pgkit saved none
 
     def save(self, path: str | Path) -> None:
         """Writes :meth:`state_dict` to a file of its own, in one step."""

@@ -180,8 +180,12 @@ def state_of(calls: Sequence[Call], num_envs: int) -> set[str]:
         path
         for path, x in first.items()
         if isinstance(x, Tensor)
-        and (x.shape[:1] == (num_envs,) or any(not torch.equal(x, other[path]) for other in values if path in other))
+        and (x.shape[:1] == (num_envs,) or any(_differ(x, other[path]) for other in values if path in other))
     }
+
+
+def _differ(one: Any, other: Any) -> bool:
+    return _kind(one) != _kind(other) or not torch.equal(one, other)
 
 
 class Native:

@@ -100,7 +100,8 @@ class Vmas:
         self._bounds = {g.name: _bounds(g, self.device) for g in self.groups}
         self._begin_counts()
         if compile != "off":
-            self._recorded = self._twin(groups).recorded(compile, kind)
+            with falls_back(kind, compile):
+                self._recorded = self._twin(groups).recorded(compile, kind)
         self._begin_native()
 
     def _twin(self, groups: Names | None) -> Vmas:
@@ -121,9 +122,7 @@ class Vmas:
     def recorded(self, mode: Mode, kind: str) -> dict[str, Recorded]:
         """Step and reset as native code, where they can be recorded; this object is the record's own from then on."""
         if isinstance(self._make["scenario"], str) and self._make["scenario"] in ELSEWHERE:
-            with falls_back(kind, mode):
-                raise RuntimeError("it keeps some of its state outside of tensors")
-            return {}
+            raise RuntimeError("it keeps some of its state outside of tensors")
 
         def play(advance: Function, renew: Function) -> None:
             actions = [self.action_spec[g.name, "action"] for g in self.groups]

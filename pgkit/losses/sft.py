@@ -46,8 +46,10 @@ class SFTLoss(Loss):
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The loss of rows ``[B]``."""
-        batch, weights = tensordict.copy(), token_weights(tensordict[self.tensor_keys.mask])
+        batch = tensordict.copy()
         with self.actor_network_params.to_module(self.actor_network):
             dist = self.actor_network.get_dist(batch.select(*self.actor_network.in_keys))
-        loss = -(weights * dist.log_prob(batch[self.tensor_keys.action])).sum()
+        log_prob = dist.log_prob(batch[self.tensor_keys.action])
+        weights = token_weights(batch[self.tensor_keys.mask], dtype=log_prob.dtype)
+        loss = -(weights * log_prob).sum()
         return TensorDict({"loss_sft": loss, "entropy": (weights * dist.entropy().detach()).sum()})

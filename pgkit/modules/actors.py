@@ -90,8 +90,12 @@ def tanh_normal_actor(
     body, space = trunk(who, hidden, activation, normalizer, encoder), cast(Any, spec.space)
     linear = who.linear(body.features, 2 * spec.shape[0])
     head = StateDependentHead(linear, log_std_bounds, loc_bound=5.0 if tanh_loc else None)
-    bounds = {"low": space.low.to(who.device), "high": space.high.to(who.device)}
-    kwargs = {**bounds, "event_dims": 1}  # its own tanh_loc moves the mean by the bounds' middle
+    device = next(linear.parameters()).device
+    kwargs = {
+        "low": space.low.to(device),
+        "high": space.high.to(device),
+        "event_dims": 1,
+    }  # its own tanh_loc moves the mean by the bounds' middle
     return probabilistic(who, body, head, ["loc", "scale"], TanhNormal, kwargs)
 
 
@@ -128,6 +132,16 @@ def actor(
     body = trunk(who, hidden, activation, normalizer, encoder)
     head = SplitHead(who, body.features, list(shapes.values()))
     return probabilistic(who, body, head, list(shapes), distribution, dict(distribution_kwargs or {}))
+
+
+class Actor(ProbabilisticActor):
+    """TorchRL's, whose distribution has its bounds where the weights are: it would copy them there in every call."""
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Actor:
+        super()._apply(fn, recurse)
+        settings = self[-1].distribution_kwargs
+        settings.update({name: fn(x) for name, x in settings.items() if isinstance(x, Tensor)})
+        return self
 
 
 class GaussianHead(nn.Module):
@@ -193,7 +207,7 @@ def probabilistic(
 ) -> ProbabilisticActor:
     """TorchRL's ``ProbabilisticActor`` of a network that writes the distribution's parameters."""
     keys = [who.key(name) for name in parameters]
-    return ProbabilisticActor(
+    return Actor(
         headed(body, head, keys, head_keys),
         in_keys=keys,
         out_keys=None if who.name is None else [who.key("action")],

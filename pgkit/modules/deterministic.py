@@ -41,7 +41,7 @@ def deterministic_actor(
     spec = box_action(who.action(), needs_bounds=True)
     body, space = trunk(who, hidden, activation, normalizer, encoder), cast(Any, spec.space)
     head = who.linear(body.features, spec.shape[0], 0.01)
-    squash = Squash(space.low, space.high).to(who.device)
+    squash = Squash(space.low, space.high).to(next(head.parameters()).device)
     return headed(body, nn.Sequential(head, squash), [who.key("action")])
 
 

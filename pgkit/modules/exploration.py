@@ -35,7 +35,7 @@ class GaussianExploration(TensorDictModuleBase):
         self, actor: TensorDictModuleBase, env: EnvBase, std: float = 0.1, *, group: str | None = None
     ) -> None:
         super().__init__()
-        self.actor, self.bounds = actor, ActionBounds(env, group)
+        self.actor, self.bounds = actor, ActionBounds(env, actor, group)
         self.in_keys, self.out_keys = list(actor.in_keys), list(actor.out_keys)
         self.register_buffer("std", torch.tensor(float(std), device=self.bounds.low.device))
 
@@ -107,7 +107,7 @@ class OrnsteinUhlenbeck(TensorDictModuleBase):
         group: str | None = None,
     ) -> None:
         super().__init__()
-        self.actor, self.bounds, self.theta = actor, ActionBounds(env, group), theta
+        self.actor, self.bounds, self.theta = actor, ActionBounds(env, actor, group), theta
         self.state_shape, self.state_size = self.bounds.shape, self.bounds.shape[-1]
         self.state_key: NestedKey = (*self.bounds.group, "recurrent_state")
         self._next_key: NestedKey = ("next", *self.state_key)
@@ -149,7 +149,7 @@ class NoiseRepeat(TensorDictModuleBase):
 
     def __init__(self, actor: TensorDictModuleBase, env: EnvBase, zeta: float = 2.0, longest: int = 16) -> None:
         super().__init__()
-        self.actor, self.bounds = actor, ActionBounds(env)
+        self.actor, self.bounds = actor, ActionBounds(env, actor)
         self.state_shape = (self.bounds.shape[-1] + 1,)  # the noise, and the steps that it has left
         self.state_key: NestedKey = (*self.bounds.group, "recurrent_state")
         self._next_key: NestedKey = ("next", *self.state_key)
@@ -175,21 +175,24 @@ class NoiseRepeat(TensorDictModuleBase):
 
 
 class ActionBounds(nn.Module):
-    """``(action, noise) -> action + half_range * noise`` within the bounds of an environment's action."""
+    """``(action, noise) -> action + half_range * noise`` within the bounds of an environment's action.
+
+    It lies where the actor does.
+    """
 
     low: Tensor
     high: Tensor
     half_range: Tensor
 
-    def __init__(self, env: EnvBase, group: str | None = None) -> None:
+    def __init__(self, env: EnvBase, actor: nn.Module, group: str | None = None) -> None:
         super().__init__()
-        who = agents(env, group)
+        who, device = agents(env, group), next((p.device for p in actor.parameters()), None)
         spec = box_action(who.action(), needs_bounds=True)
         space: Any = spec.space
         self.group = () if who.name is None else (who.name,)
         self.key, self.shape = who.key("action"), (*[who.number for _ in self.group], *spec.shape)
         for name, x in (("low", space.low), ("high", space.high), ("half_range", (space.high - space.low) / 2)):
-            self.register_buffer(name, x.clone())
+            self.register_buffer(name, x.to(device, copy=True))
 
     def forward(self, action: Tensor, noise: Tensor) -> Tensor:
         return (action + self.half_range * noise).clamp(self.low, self.high)

@@ -224,12 +224,13 @@ class RewardScale(nn.Module):
 
     @torch.no_grad()
     def update(self, rollout: TensorDictBase) -> None:
-        """Takes in a rollout ``[num_envs, T]``."""
+        """Takes in a rollout ``[num_envs, T]``; steps that its ``("collector", "mask")`` leaves out are none."""
+        mask = rollout.get(("collector", "mask"), None)
         rewards, done = (rollout["next", name].squeeze(-1).unbind(1) for name in ("reward", "done"))
         seen = []
         for reward, ended in zip(rewards, done, strict=True):
             seen.append(reward + self.gamma * self.returns)
             self.returns.copy_(seen[-1] * ~ended)
         returns = torch.stack(seen)
-        self.moments.update(returns)
+        self.moments.update(returns, None if mask is None else mask.t())
         self.largest.copy_(torch.maximum(self.largest, returns.abs().amax()))

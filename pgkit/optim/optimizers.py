@@ -82,12 +82,15 @@ def step(optimizer: Optimizer | Together, params: Sequence[Tensor], grads: Seque
         param.grad = None
     for param, grad in zip(params, grads, strict=True):
         param.grad = grad
-    adams = [group for part in parts(optimizer) if type(part) in (Adam, AdamW) for group in part.param_groups]
-    groups = [g for g in adams if g["fused"] is g["foreach"] is None and not g["differentiable"]]
-    for group in groups:
+    adams = [(group, part) for part in parts(optimizer) if type(part) in (Adam, AdamW) for group in part.param_groups]
+    fused = [(g, part) for g, part in adams if g["fused"] is g["foreach"] is None and not g["differentiable"]]
+    for group, part in fused:
         group["fused"] = True
+        for own, device in ((part.state.get(p, {}), p.device) for p in group["params"]):
+            if "step" in own:  # loaded, or made by an unfused step: torch keeps such a counter on the CPU
+                own["step"] = own["step"].to(device)
     try:
         optimizer.step()
     finally:
-        for group in groups:
+        for group, _ in fused:
             group["fused"] = None

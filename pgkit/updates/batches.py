@@ -6,10 +6,10 @@ from collections.abc import Iterator
 from typing import Any, cast
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
-from pgkit.checks import LossView, replay
+from pgkit.checks import LossView, device_of, replay
 from pgkit.data import RayReplay, ReplayBuffer
 from pgkit.errors import UserError
 
@@ -17,7 +17,7 @@ Draw = tuple[TensorDictBase, Tensor]
 
 
 class OwnBatches:
-    """From pgkit's replay: only row numbers are drawn, the rest is in the graph.
+    """From pgkit's replay: only row numbers are drawn, the rest is in the graph; a batch goes where the loss is.
 
     :meth:`extend` stores a rollout; :meth:`draw` gives a pair ``(data, index)`` a step, :meth:`gather` the batch of a
     pair and :meth:`write_back` takes its priorities, both in the graph; :meth:`written` is what that changes besides
@@ -30,13 +30,16 @@ class OwnBatches:
     def __init__(self, buffer: ReplayBuffer, loss: nn.Module, batch_size: int) -> None:
         self.buffer, self.view, self.batch_size = buffer, LossView(loss), batch_size
         self.priority = self.view.priority
+        self.device = next((p.device for p in loss.parameters()), buffer.device)
         self.capacity = buffer.capacity - (buffer.n_steps - 1) * buffer.columns  # of the last the return is not known
 
     def extend(self, rollout: TensorDictBase) -> None:
         self.buffer.extend(rollout)
 
     def gather(self, data: TensorDictBase, index: Tensor) -> TensorDictBase:
-        return self.buffer.gather(self.view.gamma if self.buffer.n_steps > 1 else 1.0)(data, index)
+        gamma = self.view.gamma if self.buffer.n_steps > 1 else 1.0
+        batch = self.buffer.gather(gamma.to(self.buffer.device) if isinstance(gamma, Tensor) else gamma)(data, index)
+        return batch if self.device.type == self.buffer.device.type else batch.to(self.device)
 
     def write_back(self, data: TensorDictBase, index: Tensor, batch: TensorDictBase) -> None:
         if self.buffer.sampler is None:
@@ -46,7 +49,8 @@ class OwnBatches:
                 f"the replay is prioritized, but {self.view.name} writes no '{self.priority}' into the "
                 "batch: write the absolute error [*B] there, or draw uniformly"
             )
-        self.buffer.write_back(data, index, batch.select().set("td_error", batch[self.priority]))
+        errors = batch[self.priority].to(index.device).reshape(-1, len(index)).amax(0)  # of copies, the largest
+        self.buffer.write_back(data, index, TensorDict({"td_error": errors}, errors.shape))
 
     def written(self) -> list[Tensor]:
         return [] if self.buffer.sampler is None else self.buffer.sampler.tensors
@@ -83,9 +87,9 @@ class TorchRLBatches:
     def draw(self, batches: int) -> Iterator[Draw]:
         for _ in range(batches):
             self._sample = self.buffer.sample(self.batch_size)
-            data = self._sample.select(*self.view.readable(self._sample))
-            self._batch = data.set(self.priority, torch.zeros(self.batch_size, device=data.device))
-            yield self._batch, torch.arange(self.batch_size, device=data.device)
+            data, device = self._sample.select(*self.view.readable(self._sample)), device_of(self._sample)
+            self._batch = data.set(self.priority, torch.zeros(self.batch_size, device=device))
+            yield self._batch, torch.arange(self.batch_size, device=device)
 
     def gather(self, data: TensorDictBase, index: Tensor) -> TensorDictBase:
         rows = data.exclude(self.priority)

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from pgkit.checks import LossView
 from pgkit.errors import UserError
+from pgkit.updates.minibatches import frames_of
 
 Batches = Sequence[tuple[Tensor, ...]]
 
@@ -24,8 +25,8 @@ class Alone:
     mean = None
     agree = bool
 
-    def begin(self, rollout: TensorDictBase) -> None:
-        pass
+    def begin(self, rollout: TensorDictBase) -> int:
+        return frames_of(rollout)
 
     def prepared(self, data: TensorDictBase, batches: Batches) -> TensorDictBase:
         return data
@@ -35,7 +36,8 @@ class Learners:
     """This process among the learners of a ``torch.distributed`` group.
 
     Args:
-        state: tensors in which every learner begins an update as the first one has them: weights, buffers.
+        state: tensors in which every learner begins an update as the first one has them: weights, buffers. Messages are
+            made where the first of them is; a coefficient may lie elsewhere.
         optimizer: its learning rates are the first learner's as well.
         generator: of the minibatch order, likewise.
         view: the loss, which says where masks lie.
@@ -58,7 +60,7 @@ class Learners:
         self.rank, self.size, self.group = dist.get_rank(group), dist.get_world_size(group), group
         self.optimizer, self.generator, self.view, self.standardized = optimizer, generator, view, list(standardized)
         self.state = sorted(state, key=lambda x: -x.element_size())  # views of their bytes then begin at whole numbers
-        self.device = self.state[0].device
+        self.device = state[0].device
         self._shares = deque[float]()
 
     def sum(self, x: Tensor) -> Tensor:
@@ -79,29 +81,33 @@ class Learners:
         return bool(vote)
 
     @torch.no_grad()
-    def begin(self, rollout: TensorDictBase) -> None:
-        """Takes over the first learner's weights, buffers, learning rates and minibatch order.
+    def begin(self, rollout: TensorDictBase) -> int:
+        """Takes over the first learner's weights, buffers, learning rates and minibatch order; the frames of all.
 
         Raises:
             UserError: the learners have different numbers of rows.
         """
-        rows = self.gather(torch.tensor([rollout.numel()], device=self.device)).tolist()
+        sizes = torch.tensor([[rollout.numel(), frames_of(rollout)]], device=self.device)
+        rows, frames = zip(*self.gather(sizes).tolist(), strict=True)
         if len(set(rows)) > 1:
-            raise UserError(f"the learners have {rows} rows of the rollout: give each the same number of environments")
+            raise UserError(
+                f"the learners have {[*rows]} rows of the rollout: give each the same number of environments"
+            )
         self._shares.clear()
         groups, order = self.optimizer.param_groups, self.generator.get_state()
         rates = torch.tensor([float(group["lr"]) for group in groups], dtype=torch.float64, device=self.device)
-        tensors = [rates, *self.state, order.to(self.device)]
-        message = torch.cat([x.detach().reshape(-1).view(torch.uint8) for x in tensors])
+        tensors = [rates, *self.state, order]
+        message = torch.cat([x.detach().to(self.device).reshape(-1).view(torch.uint8) for x in tensors])
         dist.broadcast(message, dist.get_global_rank(self.group or dist.group.WORLD, 0), group=self.group)
         if self.rank == 0:
-            return
+            return sum(frames)
         parts = message.split([x.numel() * x.element_size() for x in tensors])
         for x, part in zip(self.state, parts[1:-1], strict=True):
             x.copy_(part.view(x.dtype).view(x.shape))
         for group, rate in zip(groups, parts[0].view(torch.float64).tolist(), strict=True):
             group["lr"] = rate
         self.generator.set_state(parts[-1].cpu().clone())  # torch reads a view from its memory's beginning
+        return sum(frames)
 
     @torch.no_grad()
     def prepared(self, data: TensorDictBase, batches: Batches) -> TensorDictBase:
@@ -114,7 +120,8 @@ class Learners:
         sizes = torch.tensor([len(index) for index in parts], device=order.device)
         which = torch.arange(len(parts), device=order.device).repeat_interleave(sizes)
         for key in self.standardized:
-            x, counts = data[key], self._mask(data, key)
+            x, counts = data[key], self.view.counting(data, data[key], key)
+            counts = torch.ones_like(x) if counts is None else counts.to(x.dtype)
             stats = _moments(*(y[order].reshape(len(order), -1) for y in (x, counts)), which, len(parts))
             _, mean, deviation = _combined(self.gather(stats[None]))
             shape = (-1, *[1] * (x.dim() - 1))
@@ -148,13 +155,6 @@ class Learners:
         squares = ((kept - mean) * counts).square().sum(axes, keepdim=True)
         _, mean, deviation = _combined(self.gather(torch.stack([count, mean, squares])[None]))
         return (x - mean) / deviation
-
-    def _mask(self, data: TensorDictBase, key: Any) -> Tensor:
-        """Which elements of an entry count, in its shape and type."""
-        x, where = data[key], () if isinstance(key, str) else key[:-1]
-        groups = ((), ("collector",), where)
-        keys = [m for m in self.view.masks if m in data.keys(True) and (() if isinstance(m, str) else m[:-1]) in groups]
-        return _together([torch.ones_like(x), *(data[m] for m in keys)])
 
 
 def _together(masks: Sequence[Tensor]) -> Tensor:

@@ -33,15 +33,20 @@ def as_rows(data: TensorDictBase, length: int | None) -> TensorDictBase:
 
 
 def minibatches(
-    rows: int, size: int, generator: torch.Generator, device: torch.device | None, together: int = 1
+    rows: int, size: int, generator: torch.Generator, device: torch.device, together: int = 1
 ) -> Iterator[tuple[Tensor, ...]]:
     """All rows in a new order, in minibatches; so many ``together`` make one step. The last ones may be smaller.
 
     The order is drawn on the CPU: it is the same on every device.
     """
-    order = torch.randperm(rows, generator=generator)
-    parts = (order if device is None else order.to(device)).split(size)
+    parts = torch.randperm(rows, generator=generator).to(device).split(size)
     yield from (parts[first : first + together] for first in range(0, len(parts), together))
+
+
+def frames_of(rollout: TensorDictBase) -> int:
+    """Frames of a rollout: the steps whose action counted."""
+    mask = rollout.get(("collector", "mask"), None)
+    return rollout.numel() if mask is None else int(mask.sum())
 
 
 def means(names: Sequence[str], results: Sequence[Tensor]) -> dict[str, float]:
@@ -49,7 +54,7 @@ def means(names: Sequence[str], results: Sequence[Tensor]) -> dict[str, float]:
 
     Skipped steps, of which the last metric is 1, are left out, but for that metric; unless all were.
     """
-    every = torch.stack(tuple(results))
+    every = torch.stack(tuple(results)).cpu()
     taken = every[every[:, -1] == 0]
     mean = (taken if len(taken) else every).mean(0).tolist()
     return dict(zip(names, [*mean[:-1], every[:, -1].mean().item()], strict=True))

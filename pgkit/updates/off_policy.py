@@ -20,7 +20,7 @@ from pgkit.errors import UserError
 from pgkit.seams import Augmentation
 from pgkit.updates.batches import Batches, batches_of
 from pgkit.updates.interrupts import interruptible
-from pgkit.updates.minibatches import means
+from pgkit.updates.minibatches import frames_of, means
 from pgkit.updates.state import load, save
 from pgkit.updates.step import GradientStep, Grads, grads_of, metrics_of, norm_of
 from pgkit.updates.targets import averaging, copying
@@ -112,7 +112,8 @@ class OffPolicyUpdate:
     def __call__(self, rollout: TensorDictBase) -> dict[str, float]:
         """Stores a rollout ``[num_envs, T]`` and trains; metrics are means over the steps, none if none was due."""
         self._batches.extend(rollout)
-        self.frames += rollout.numel()
+        frames = frames_of(rollout)
+        self.frames += frames
         stored = self.buffer.written if isinstance(self.buffer, ReplayBuffer) else len(self.buffer)
         if stored < self.learning_starts:
             return {}
@@ -124,7 +125,7 @@ class OffPolicyUpdate:
                     "its capacity (--buffer-size) or ReplayBuffer(final_rows=...)"
                 )
             return {}
-        self._due += rollout.numel() * self.updates_per_step
+        self._due += frames * self.updates_per_step
         count = int(self._due)
         self._due -= count
         return self.train(count)

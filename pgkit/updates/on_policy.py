@@ -13,7 +13,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from pgkit.checks import LossView, assembly, check_settings, diagram, result_of
+from pgkit.checks import LossView, assembly, check_settings, device_of, diagram, result_of
 from pgkit.compiled import Compiled, Mode, check_compile, choose, compiled, undone
 from pgkit.errors import UserError
 from pgkit.functional import standardize
@@ -117,26 +117,26 @@ class OnPolicyUpdate:
 
         Time is the last dimension: flattened, an advantage would run from one environment into the next.
         """
-        self.learners.begin(rollout)
+        frames = self.learners.begin(rollout)
         self._follow_schedules()
         if self._plan is None:
             self._plan, flat = self._assemble(rollout)
         else:
             flat = self._rows(self._plan, rollout)
-        plan, size, results = self._plan, self._size(flat), list[Tensor]()
+        plan, size, device, results = self._plan, self._size(flat), device_of(flat), list[Tensor]()
         epoch, bound, step = 0, None, plan.step
         for epoch in range(1, self.epochs + 1):
             if epoch > 1 and self.recompute_advantage:
                 flat = self._rows(plan, rollout).update(flat.select(*plan.anchors))
-            batches = list(minibatches(len(flat), size, self.generator, flat.device, self.accumulate))
+            batches = list(minibatches(len(flat), size, self.generator, device, self.accumulate))
             rows = self.learners.prepared(flat, batches)
             if rows is not bound:
-                bound, step = rows, plan.step.bind(rows, torch.arange(size, device=flat.device))
+                bound, step = rows, plan.step.bind(rows, torch.arange(size, device=device))
             start = len(results)
             results += [step(*indices) for indices in batches]
             if self.target_kl is not None and self._kl(plan.step.names, results[start:]) > 1.5 * self.target_kl:
                 break
-        self.frames += rollout.numel() * self.learners.size
+        self.frames += frames
         rate = float(self.optimizer.param_groups[0]["lr"])
         return means(plan.step.names, results) | {"epochs": float(epoch), "learning_rate": rate}
 
@@ -195,14 +195,15 @@ class OnPolicyUpdate:
 
     def _gradient_step(self, names: Sequence[str], frames: int, steps: int) -> GradientStep:
         """One step on a minibatch, of so many steps for so many frames."""
-        params, key = parameters(self.optimizer), self._view.key("advantage") or "advantage"
+        params, view = parameters(self.optimizer), self._view
+        key = view.key("advantage") or "advantage"
 
         def gradients(data: TensorDictBase, index: Tensor) -> tuple[list[Tensor], Grads]:
             batch = cast(TensorDictBase, data[index])
             if self.augment is not None:
                 batch = self.augment(batch)
             if self.normalize_advantage:
-                batch = batch.copy().set(key, standardize(batch[key]))
+                batch = batch.copy().set(key, standardize(batch[key], view.counting(batch, batch[key], key)))
             out = result_of(self.loss, batch)
             grads = grads_of(out, params)
             return metrics_of(out, names, like=grads[0]), grads

@@ -12,12 +12,12 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torch.optim import SGD, Optimizer
 
-from pgkit.checks import LossView, assembly, check_settings, diagram
+from pgkit.checks import LossView, assembly, check_settings, device_of, diagram
 from pgkit.compiled import check_compile, choose, undone
 from pgkit.functional import conjugate_gradient
 from pgkit.optim import parameters
 from pgkit.updates.interrupts import interruptible
-from pgkit.updates.minibatches import as_rows, means, minibatches
+from pgkit.updates.minibatches import as_rows, frames_of, means, minibatches
 from pgkit.updates.state import load, save
 from pgkit.updates.step import GradientStep, Grads, grads_of, metrics_of
 
@@ -115,7 +115,7 @@ class TrustRegionUpdate:
         metrics = self._step_policy(self.loss.keep_distribution(flat.copy()), plan.names)
         if plan.critic is not None:
             metrics |= self._step_critic(plan.critic, flat)
-        self.frames += len(flat)
+        self.frames += frames_of(rollout)
         return metrics
 
     def __str__(self) -> str:
@@ -140,7 +140,7 @@ class TrustRegionUpdate:
         for size in self.sizes:
             self._assign(start + size * full)
             with torch.no_grad():
-                improvement, kl = float(before - self._policy_loss(self.loss(batch))), float(self.loss.kl(batch).mean())
+                improvement, kl = float(before - self._policy_loss(self.loss(batch))), float(self._mean_kl(batch))
             better = improvement > 0 and kl <= self.max_kl
             if better if self.line_search else full.isfinite().all():
                 result = {"kl": kl, "improvement": improvement, "step_size": size}
@@ -152,12 +152,18 @@ class TrustRegionUpdate:
 
     def _fisher(self, batch: TensorDictBase) -> Callable[[Tensor], Tensor]:
         """``v -> (F + damping) v`` at the policy that is kept in the batch."""
-        slope = _flat(torch.autograd.grad(self.loss.kl(batch).mean(), self._params, create_graph=True))
+        slope = _flat(torch.autograd.grad(self._mean_kl(batch), self._params, create_graph=True))
 
         def product(v: Tensor) -> Tensor:
             return _flat(torch.autograd.grad(slope @ v, self._params, retain_graph=True)) + self.damping * v
 
         return product
+
+    def _mean_kl(self, batch: TensorDictBase) -> Tensor:
+        """KL divergence from the policy that is kept in the batch, over the rows that count."""
+        kl, view = self.loss.kl(batch), self._view
+        mask = view.counting(batch, kl, [*view.keys("action"), "action"][0])
+        return kl.mean() if mask is None else torch.where(mask, kl, 0.0).sum() / mask.sum().clamp(min=1)
 
     def _policy_loss(self, out: TensorDictBase) -> Tensor:
         return torch.stack([out[key] for key in out.keys() if key.startswith("loss_") and key != CRITIC]).sum()
@@ -168,10 +174,10 @@ class TrustRegionUpdate:
                 p.copy_(part.view_as(p))
 
     def _step_critic(self, step: GradientStep, flat: TensorDictBase) -> dict[str, float]:
-        size, results = int(min(self.minibatch_size or len(flat), len(flat))), []
-        call = step.bind(flat, torch.arange(size, device=flat.device))
+        size, device, results = int(min(self.minibatch_size or len(flat), len(flat))), device_of(flat), []
+        call = step.bind(flat, torch.arange(size, device=device))
         for _ in range(self.epochs):
-            for indices in minibatches(len(flat), size, self._generator, flat.device):
+            for indices in minibatches(len(flat), size, self._generator, device):
                 results.append(call(*indices))
         return means(step.names, results)
 

@@ -1,3 +1,5 @@
+import copy
+
 import pytest
 import torch
 from torchrl.objectives.value import GAE as TorchRLGAE
@@ -57,3 +59,9 @@ def test_return_scale_changes_the_target_only_in_unit(agent):
     torch.testing.assert_close(out["advantage"], target - 3 * out["state_value"], rtol=1e-4, atol=1e-4)
     scale.update(out["value_target"])
     assert scale.scale.item() == pytest.approx(target.std(correction=0).item(), rel=1e-3)
+
+
+@pytest.mark.parametrize("kind", [advantages.GAE, advantages.TDLambda, lambda critic: advantages.VTrace(critic, None)])
+def test_its_numbers_lie_where_the_critic_is(agent, kind):
+    block = kind(copy.deepcopy(agent[0]).to("meta"))
+    assert block.gamma.device.type == block.lmbda.device.type == "meta" and block.gamma.dtype == torch.float64

@@ -8,7 +8,7 @@ from torch import nn
 from torchrl.modules import IndependentNormal, ProbabilisticActor
 
 from pgkit import losses
-from pgkit.checks import LossView
+from pgkit.checks import LossView, device_of
 from pgkit.checks.rollouts import check_order
 from pgkit.errors import UserError
 
@@ -68,6 +68,12 @@ def test_a_rollout_in_order_passes():
 def test_rows_that_are_no_successors_are_found(wrong, where):
     with pytest.raises(UserError, match=where):
         check_order(view_of("observation"), wrong(rollout_of(observation=(3,))))
+
+
+def test_a_rollout_need_not_say_where_its_tensors_are():
+    rollout = rollout_of(observation=(3,)).apply(lambda x: x.to("meta"))
+    assert rollout.device is None and device_of(rollout).type == "meta"
+    check_order(view_of("another"), rollout)  # meta tensors have no values to compare
 
 
 def test_what_ends_an_episode_or_does_not_count_may_lead_anywhere():

@@ -8,9 +8,11 @@ import pytest
 import torch
 from torch._subclasses.fake_tensor import DataDependentOutputException, FakeTensorDeviceMismatchError, FakeTensorMode
 
-from pgkit import modules
+from pgkit import data, envs, modules
 from pgkit.updates import GradientStep
+from pgkit.updates.batches import OwnBatches
 from pgkit.updates.step import grads_of, metrics_of
+from tests.data.test_replay import hand_made
 from tests.losses.test_contract import ALGORITHMS, batch, make
 
 BUILDERS = ("gaussian_actor", "deterministic_actor", "tanh_normal_actor", "categorical_actor", "state_value")
@@ -50,6 +52,18 @@ def bare_step(name, spoil=lambda batch: None):
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_the_step_stays_on_its_device_and_reads_no_value_back(name):
     bare_step(name)
+
+
+@pytest.mark.parametrize("n_steps", [1, 3])
+def test_a_replay_on_the_cpu_gives_batches_where_the_loss_is_and_takes_errors_from_there(n_steps):
+    env = envs.make("Pendulum-v1")
+    buffer = data.ReplayBuffer(env, 100, n_steps=n_steps, sampler=data.Prioritized())
+    buffer.extend(hand_made(range(33), [1.0] * 32))
+    rows, index = OwnBatches(buffer, make("SACLoss"), 8), buffer.sample_index(8)[0]
+    with FakeTensorMode(allow_non_fake_inputs=True):
+        batch = rows.gather(buffer.data, index)
+        assert {x.device.type for x in batch.values(True, True)} == {"meta"}
+        rows.write_back(buffer.data, index, batch.set("td_error", torch.ones(8, device="meta")))
 
 
 def test_what_would_be_wrong_shows():

@@ -112,6 +112,18 @@ def test_what_a_module_holds_is_noticed(caplog):
     assert "the test is compiled again: in the net 'scale' went from 2.0 to 5.0" in caplog.text
 
 
+def test_what_a_module_holds_is_noticed_after_a_layout_that_nothing_bears(monkeypatch):
+    net, data = Net(), rows()
+    made = native(net, "record")
+    made.bind(data, INDEX)
+    with monkeypatch.context() as patch:
+        patch.setattr(recorded, "record", None)
+        made.bind(data, INDEX[:2])
+        assert made.rung == "eager"
+    net.scale = 5.0
+    torch.testing.assert_close(made.bind(data, INDEX)(INDEX)[0], 5 * data["x"][INDEX] @ net.w)
+
+
 def moved(name, error):
     def raises(*_, **__):
         raise error

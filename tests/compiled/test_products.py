@@ -195,3 +195,8 @@ def test_a_kernel_that_is_not_here_is_torchs_and_says_so(monkeypatch, caplog):
 def test_another_setting_is_refused():
     with pytest.raises(UserError, match="'auto', 'float32' or 'bf16', not 'fp16'"):
         set_matmul("fp16")
+
+
+def test_what_the_compiler_raises_is_what_is_told():
+    with pytest.raises(RuntimeError, match="of the compiler"), products.as_they_are():
+        raise RuntimeError("of the compiler")

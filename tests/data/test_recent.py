@@ -21,3 +21,9 @@ def test_state_travels():
     recent(rollout(1))
     again.load_state_dict(recent.state_dict())
     assert torch.equal(again(rollout(2))["x"], recent(rollout(2))["x"])
+
+
+def test_rollouts_that_a_checkpoint_brought_to_the_cpu_go_where_the_newest_is():
+    recent = data.Recent(2)
+    recent.load_state_dict({"kept": [rollout(1), rollout(2)]})
+    assert recent(rollout(3).to("meta"))["x"].device.type == "meta"

@@ -2,6 +2,7 @@
 
 from functools import partial
 
+import gymnasium as gym
 import pytest
 import torch
 from tensordict import TensorDict
@@ -317,3 +318,36 @@ def test_damaged_files_are_one_line(tmp_path, damage):
     with pytest.raises(UserError, match="is damaged|is no saved replay buffer") as error:
         buffer.load(path)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("num_envs", [1, 3])
+@pytest.mark.parametrize("steps", [1, 40])
+@pytest.mark.parametrize("prioritized", [False, True])
+def test_frames_that_a_mask_leaves_out_are_never_drawn(num_envs, steps, prioritized):
+    """CartPole pays 1 for every step; a row whose action Gymnasium ignores, since it resets, is no step and pays 0."""
+
+    def make():
+        return data.ReplayBuffer(env, 150, sampler=data.Prioritized() if prioritized else None, seed=0)
+
+    env = envs.make(gym.make_vec("CartPole-v1", num_envs=num_envs), seed=1)
+    buffer, again = make(), make()
+    actor, frames = modules.categorical_actor(env), num_envs * steps
+    collector = collectors.VectorCollector(env, actor, frames_per_batch=frames, compile="off")
+    masks = []
+    for _ in range(240 // steps):
+        rollout = collector.rollout()
+        masks.append(rollout["collector", "mask"])
+        buffer.extend(rollout)
+    assert (~torch.cat(masks, 1)[:, -150 // num_envs :]).any()  # there are some
+    again.load_state_dict(buffer.state_dict())
+    for one in (buffer, again):
+        for _ in range(20):
+            assert (one.sample(len(one))["next", "reward"] == 1).all()
+
+
+def test_what_comes_to_the_cpu_is_waited_for(monkeypatch):
+    """A copy from a GPU that nobody waits for is read before it is there: the CPU holds the frames then."""
+    buffer, moved, to = data.ReplayBuffer(envs.make("Pendulum-v1"), 10), [], torch.Tensor.to
+    monkeypatch.setattr(torch.Tensor, "to", lambda x, *args, **given: moved.append(given) or to(x, *args, **given))
+    buffer.extend(hand_made([0, 1, 2], [1, 1]))
+    assert moved and not any(given.get("non_blocking") for given in moved)

@@ -89,6 +89,23 @@ def test_sum_and_mean_and_none_are_the_same_loss(name):
         assert each[key].shape in ((16,), ())
 
 
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_rows_that_a_mask_leaves_out_count_nowhere(name):
+    found = []
+    for spoilt in (1.0, 50.0):
+        data = batch(name)
+        for x in (data["observation"], data["next", "observation"], data["next", "reward"], *map(data.get, PER_ROW)):
+            if x is not None:
+                x[10:] *= spoilt
+        data["collector", "mask"] = torch.arange(16) < 10
+        out = result(make(name), data)
+        found.append(
+            {key: x for key, x in out.items() if not key.endswith("_max")} | {"td_error": data.get("td_error", 0)}
+        )
+    torch.testing.assert_close(*found)
+
+
+PER_ROW = ("advantage", "value_target", "state_value", "action_log_prob")
 OTHER = {
     "actor_value": ("min", "mean"), "alpha_init": (1.0, 0.5), "clip_epsilon": (0.2, 0.1), "critic_coeff": (1.0, 0.5),
     "entropy_coeff": (0.0, 0.1), "form": ("expectation", "gumbel_softmax"), "gamma": (0.99, 0.9),

@@ -3,6 +3,7 @@ import pytest
 import torch
 from torch import nn
 from torchrl.envs import GymEnv
+from torchrl.modules import ProbabilisticActor
 
 from pgkit import envs, losses, modules
 from pgkit.errors import UserError
@@ -120,3 +121,16 @@ def test_actions_that_are_no_vector_are_refused(make):
 
     with pytest.raises(UserError, match=r"actions have shape \(2, 3\)"):
         make(envs.make(Matrix))
+
+
+@pytest.mark.parametrize("build", [modules.tanh_normal_actor, modules.deterministic_actor, modules.gaussian_actor])
+@pytest.mark.parametrize("how", ["default", "given", "moved"])
+def test_the_bounds_of_an_action_lie_where_the_weights_are(build, how):
+    """A GPU, which the meta device stands for here, would get a copy of them in every call, or refuse them."""
+    env = envs.make("Pendulum-v1")
+    with torch.device("meta" if how == "default" else "cpu"):
+        actor = build(env, (8,), device="meta" if how == "given" else None)
+    actor = actor.to("meta") if how == "moved" else actor
+    settings = getattr(actor[-1], "distribution_kwargs", {}) if isinstance(actor, ProbabilisticActor) else {}
+    tensors = [*actor.parameters(), *actor.buffers(), *(x for x in settings.values() if isinstance(x, torch.Tensor))]
+    assert {x.device.type for x in tensors} == {"meta"}

@@ -172,3 +172,11 @@ def _starts(drawn):
     starts = torch.zeros_like(drawn)
     starts[:, ::200] = True
     return starts[:, 1:]
+
+
+@pytest.mark.parametrize("kind", [modules.GaussianExploration, modules.OrnsteinUhlenbeck, modules.NoiseRepeat])
+def test_the_noise_is_made_where_the_actor_is(kind):
+    """Which may be a GPU, for which the meta device stands here, and the environment on the CPU."""
+    env = envs.make("Pendulum-v1")
+    explorer = kind(modules.tanh_normal_actor(env, (8,), device="meta"), env)
+    assert {x.device.type for x in explorer.buffers()} == {"meta"}

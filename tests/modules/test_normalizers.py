@@ -197,3 +197,13 @@ def test_rewards_are_divided_by_the_deviation_or_the_largest_of_their_returns():
     batch = TensorDict({"next": {"reward": torch.tensor([[3.0]])}}, [1])
     assert scale(batch)["next", "reward"].item() == pytest.approx(3 / returns.std(correction=0).item())
     assert batch["next", "reward"].item() == 3.0
+
+
+def test_a_step_that_does_not_count_is_no_reward():
+    # an episode of returns 1 and 2.5 (gamma 0.5), the row in which Gymnasium resets, an episode of 8
+    rewards, done = torch.tensor([[1.0, 2.0, 0.0, 8.0]]), torch.tensor([[False, True, False, False]])
+    rollout = TensorDict({"next": {"reward": rewards[..., None], "done": done[..., None]}}, [1, 4])
+    rollout["collector", "mask"] = torch.tensor([[True, True, False, True]])
+    scale = modules.RewardScale(1, gamma=0.5)
+    scale.update(rollout)
+    torch.testing.assert_close(scale.moments.mean, torch.tensor([1.0, 2.5, 8.0]).mean())

@@ -200,3 +200,14 @@ def test_the_step_outside_leaves_the_user_s_settings_and_other_parameters_alone(
     optim.step(optimizer, params[:1], [torch.ones(3)])
     assert taken == [True, None]  # fused where nothing was chosen
     assert {**settings, "foreach": True} == optimizer.param_groups[0] and torch.equal(params[1], before)
+
+
+@pytest.mark.parametrize("together", [False, True])
+def test_a_counter_that_a_checkpoint_brought_to_the_cpu_goes_where_the_parameter_is(together):
+    """The fused kernel of a GPU reads it there; a GPU stands here as the meta device."""
+    p = torch.zeros(3, device="meta", requires_grad=True)
+    adam = torch.optim.Adam([p])
+    moments = {name: torch.zeros_like(p, requires_grad=False) for name in ("exp_avg", "exp_avg_sq")}
+    adam.state[p] = {"step": torch.tensor(7.0), **moments}
+    optim.step(optim.Together(adam) if together else adam, [p], [torch.ones_like(p)])
+    assert adam.state[p]["step"].device == p.device

@@ -86,7 +86,7 @@ def test_single_precision_agrees_with_double(name: str, rows: int, seed: int):
 
 @given(st.integers(1, 50), st.integers(1, 60), st.integers(1, 5), SEEDS)
 def test_an_epoch_has_every_row_once(rows: int, size: int, together: int, seed: int):
-    steps = list(minibatches(rows, size, torch.Generator().manual_seed(seed), None, together))
+    steps = list(minibatches(rows, size, torch.Generator().manual_seed(seed), torch.device("cpu"), together))
     parts = [part for step in steps for part in step]
     assert torch.cat(parts).sort().values.tolist() == list(range(rows))
     assert all(len(part) == size for part in parts[:-1]) and all(len(step) <= together for step in steps)

@@ -13,7 +13,9 @@ from torchrl.objectives import SACLoss as TorchRLSACLoss
 
 from pgkit import collectors, controllers, data, envs, heads, losses, modules, updates
 from pgkit.errors import UserError
+from pgkit.updates.batches import OwnBatches
 from pgkit.updates.targets import averaging
+from tests.data.test_replay import hand_made
 
 
 def agent(
@@ -529,3 +531,12 @@ def test_projection_follows_the_optimizer_and_comes_before_the_targets():
     train(update, collector, rollouts=3)
     every, critics = len(update.optimizer.param_groups[0]["params"]), 2 * 2  # weight and bias of two layers
     assert update.updates == 16 and seen == [every, "averaged", critics, "averaged"] * 8
+
+
+def test_copies_of_a_batch_give_each_row_one_priority():
+    sampler = data.Prioritized(alpha=1.0, eps=0.0)
+    buffer = data.ReplayBuffer(envs.make("Pendulum-v1"), 20, sampler=sampler)
+    buffer.extend(hand_made(range(9), [1.0] * 8))
+    copies = TensorDict({"td_error": torch.tensor([[1.0, 2.0], [4.0, 1.0]])}, [2, 2])  # as random_shift(copies=2) makes
+    OwnBatches(buffer, torch.nn.Linear(1, 1), 2).write_back(buffer.data, torch.tensor([3, 5]), copies)
+    assert sampler.tree.values[[3, 5]].tolist() == [4.0, 2.0]

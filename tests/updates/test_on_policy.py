@@ -355,6 +355,20 @@ def test_a_last_minibatch_of_one_row_is_no_nan():
     assert all(p.isfinite().all() for p in update.loss.parameters())
 
 
+def test_rows_that_a_mask_leaves_out_are_in_no_average_and_are_no_frames():
+    results = []
+    for spoilt in (0.0, 1e6):
+        loss = partial(losses.ClipPPOLoss, normalize_advantage=False)
+        update, rollout = make_agent(loss_class=loss, normalize_advantage=True, advantage=None), make_rollout()
+        mask = torch.arange(64).expand(2, 64) % 4 > 0
+        rollout["advantage"] = torch.where(mask.unsqueeze(-1), rollout["next", "reward"], spoilt)
+        rollout["value_target"], rollout["collector", "mask"] = rollout["next", "reward"], mask
+        update(rollout)
+        assert update.frames == 96
+        results.append(parameters(update))
+    assert torch.equal(*results)
+
+
 def test_a_schedule_of_what_the_loss_does_not_have_is_refused():
     with pytest.raises(UserError, match="'clip_epsilom'.*lr, clip_epsilon, critic_coeff, entropy_coeff"):
         make_agent(schedules={"clip_epsilom": lambda progress: 0.1}, total_frames=100)

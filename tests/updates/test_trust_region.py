@@ -1,6 +1,7 @@
 """TRPO's update: the Fisher product, the step by hand, the bound, the line search, resume, refusals."""
 
 import copy
+from typing import cast
 
 import pytest
 import torch
@@ -56,7 +57,8 @@ def gaussian():
     )  # fmt: skip
 
 
-def test_natural_step_by_hand():
+@pytest.mark.parametrize("masked", [False, True])
+def test_natural_step_by_hand(masked):
     # mean w.x, deviation 2, x = (1, 0) and (0, 2): KL of the step dw is the mean of (dw.x)^2 / 8, so
     # F = mean of x x^T / 4 = diag(1/8, 1/2). At w = 0 the gradient of log pi is (a / 4) x: a = 4, 4, A = 1, -1 give
     # the objective's gradient g = mean of A (a / 4) x = (1/2, -1), F^-1 g = (4, -2), g.F^-1 g = 4
@@ -72,6 +74,10 @@ def test_natural_step_by_hand():
     )
     dist = actor.get_dist(batch.copy())
     batch["action_log_prob"] = dist.log_prob(batch["action"]).detach()
+    if masked:  # a third row that does not count
+        batch = cast(TensorDict, batch[[0, 1, 1]])
+        batch["observation"][2] = 30.0
+        batch["collector", "mask"] = torch.tensor([True, True, False])
     update = updates.TrustRegionUpdate(
         losses.TRPOLoss(actor), None, max_kl=0.02, damping=0.0, line_search=False, compile="off"
     )
