@@ -79,7 +79,9 @@ class Acting:
         if self.device is not None and self.device.type != "cpu":
             inputs = {key: x.to(self.device) for key, x in inputs.items()}
         with torch.no_grad():
-            *actions, self.state = self._act(inputs, deterministic)(*inputs.values())
+            actions = self._act(inputs, deterministic)(*inputs.values())
+        if self.memory is not None:
+            *actions, self.state = actions
         return dict(zip(self.keys, actions, strict=True))
 
     def _act(self, inputs: Entries, deterministic: bool) -> Act:
@@ -108,8 +110,7 @@ class Acting:
             with in_evaluation(self.policy), set_exploration_type(kind):
                 out = self.policy(data)
             found = [out[key] for key in self.keys]
-            none = torch.empty(0)
-            return [*found, none if self.memory is None else out.get(("next", *path_of(self.memory[0])))]
+            return found if self.memory is None else [*found, out.get(("next", *path_of(self.memory[0])))]
 
         return act
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch._dynamo.utils import counters
 
-from pgkit.compiled.native import compile_record, record
+from pgkit.compiled.native import call_functions, compile_record, record
 
 BIAS = torch.arange(4.0)
 WEIGHT = torch.nn.Parameter(torch.linspace(-1, 1, 12).reshape(3, 4))
@@ -84,3 +84,17 @@ def test_what_was_compiled_once_is_not_compiled_again(monkeypatch):
     other = str(uuid4())
     monkeypatch.setattr("pgkit.compiled.native.cpu", lambda: other)
     assert compiled() == hits + 1 and compiled() == hits + 2
+
+
+@torch.no_grad()
+def test_functions_in_the_place_of_operations_change_no_bit():
+    def function(x):
+        y = torch.addmm(BIAS, x, WEIGHT).tanh().clamp(-0.5, 0.5)
+        parts = torch.cat([y, y.rsqrt(), 1 / y, 2 - y, y**2], -1).unsqueeze(0).squeeze(0)
+        return [torch.where(parts > 0, parts, -parts.abs()), x.t().sum(), torch.stack([x, x], 1)]
+
+    x = torch.linspace(-2, 2, 6).reshape(2, 3)
+    graph = call_functions(record(function, [x]))
+    assert any(node.target is torch.tanh for node in graph.graph.nodes)
+    for got, expected in zip(graph(x), function(x), strict=True):
+        assert torch.equal(got.nan_to_num(7.5), expected.nan_to_num(7.5))
