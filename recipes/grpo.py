@@ -72,9 +72,9 @@ class Args(run.RunArgs):
     """Its attention heads."""
     model: Path | None = None
     """Hugging Face folder or GGUF file in place of the transformer; --init takes such a folder too."""
-    warm_start: float = run.setting(0.35, low=0, high=1)
+    warm_start: float = run.setting(0.38, low=0, high=1)
     """Learn from the task's imperfect teacher until so many of the held-out prompts are solved; 0: not at all."""
-    warm_steps: int = run.setting(2_000, low=1)
+    warm_steps: int = run.setting(4_000, low=1)
     """Supervised steps at most, of 64 answers each; their learning rate rises for a twentieth of them, then falls."""
     teacher: Literal["imperfect", "perfect"] = "imperfect"
     """perfect: the warm start learns from correct solutions, for comparison."""
