@@ -16,6 +16,7 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 from torch._guards import TracingContext, tracing
+from torch._ops import OpOverload
 from torch._subclasses import FakeTensorMode
 from torch.compiler import is_dynamo_compiling
 from torch.fx import GraphModule, Node, Proxy
@@ -112,9 +113,10 @@ _FUNCTIONS = (torch.abs, torch.add, torch.addmm, torch.bmm, torch.cat, torch.cla
 
 def call_functions(graph: GraphModule) -> GraphModule:
     """Torch's functions in the place of a record's operations, where there are such: each call costs a third."""
-    functions = {getattr(torch.ops.aten, function.__name__): function for function in _FUNCTIONS}
+    functions = {f"aten::{function.__name__}": function for function in _FUNCTIONS}
     for node in graph.graph.nodes:
-        node.target = functions.get(getattr(node.target, "overloadpacket", None), node.target)
+        if isinstance(node.target, OpOverload):
+            node.target = functions.get(node.target.name().partition(".")[0], node.target)
     graph.recompile()
     return graph
 
@@ -195,8 +197,9 @@ def compile_record(graph: GraphModule, inputs: Sequence[Tensor]) -> Callable[[li
         return kernels[-1][1]
 
     # with a record of shapes, inductor keeps its code for later processes; its key lacks the CPU's instructions
-    shapes = TracingContext(FakeTensorMode(allow_non_fake_inputs=True, shape_env=ShapeEnv()))
-    kept = torch.compiler.config.patch(cache_key_tag=cpu())
+    fixed = ShapeEnv(allow_scalar_outputs=False, allow_dynamic_output_shape_ops=False)
+    shapes = TracingContext(FakeTensorMode(allow_non_fake_inputs=True, shape_env=fixed))
+    kept = torch.compiler.config.patch(cache_key_tag=f"pgkit, {cpu()}")
     with torch.no_grad(), as_they_are(), tracing(shapes), kept:
         code = compile_fx(graph, tensors, inner_compile=compile_kernels, config_patches=options)
     # around the kernels, aliases are taken apart: nothing to do where they take and give what the graph does

@@ -217,7 +217,7 @@ def test_a_forbidden_action_stays_harmless_at_any_temperature(form):
     assert all(grad.isfinite().all() for grad in grads)
 
 
-@pytest.mark.parametrize(("form", "one_hot"), zip(FORMS, [False, True], strict=True))
+@pytest.mark.parametrize(("form", "one_hot"), list(zip(FORMS, [False, True], strict=True)))
 def test_trains_on_replayed_actions_eager_as_compiled(form, one_hot):
     results = []
     for compile in ("off", "on"):
