@@ -21,15 +21,17 @@ from pgkit.run.settings import parse
 
 
 def rays_processes() -> set[str]:
-    """Processes of this one's session that Ray started."""
-    found = set()
+    """Processes that Ray started for this one, and not for another of the tests' processes."""
+    found, session, variable = set(), os.getsid(0), "PYTEST_XDIST_WORKER"
     for pid in filter(str.isdigit, os.listdir("/proc")):
         try:
-            with open(f"/proc/{pid}/stat") as file:
-                name, rest = file.read().rpartition(")")[::2]
+            with open(f"/proc/{pid}/stat") as stat, open(f"/proc/{pid}/environ") as environ:
+                name, rest = stat.read().rpartition(")")[::2]
+                worker = dict(line.partition("=")[::2] for line in environ.read().split("\0")).get(variable)
         except OSError:
             continue
-        if int(rest.split()[3]) == os.getsid(0) and name.partition("(")[2].startswith(("ray", "gcs_server")):
+        ours = int(rest.split()[3]) == session and worker == os.environ.get(variable)
+        if ours and name.partition("(")[2].startswith(("ray", "gcs_server")):
             found.add(name)
     return found
 
